@@ -1,0 +1,1 @@
+"""Composing operators to graphs, and running them."""

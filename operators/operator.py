@@ -1,0 +1,159 @@
+"""What an operator is, and what the runtime gives it.
+
+An operator reads messages from its inputs and sends messages to its outputs. `Inputs` and `Outputs` are
+frozen dataclasses whose fields are `Receiver[M]` and `Sender[M]`; the graph and mypy check the wiring
+from these annotations. A source has no inputs, a sink has no outputs (`NoPorts`).
+
+`run` is the flow and holds no arithmetic; heavy calls go through `offload`, which runs them where the
+graph file says. When the inputs end, `run` returns and the runtime closes the outputs. After a seek or
+a jump of the clock the runtime makes a new operator and runs it, unless `spans_epochs` is set.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections import deque
+from collections.abc import Awaitable, Callable
+from contextvars import ContextVar
+from dataclasses import dataclass, field
+from time import monotonic_ns as _monotonic_ns
+from typing import Any, ClassVar, Generic, Literal, TypeVar
+
+import anyio
+import anyio.to_thread
+from pydantic import BaseModel, ConfigDict
+
+from mapstream.streams.channel import Receiver
+from mapstream.streams.clock import Clock, WallClock
+from mapstream.streams.messages.sensors import Message
+
+InputsT = TypeVar("InputsT")
+OutputsT = TypeVar("OutputsT")
+M = TypeVar("M", bound=Message)
+R = TypeVar("R")
+
+Placement = Literal["inline", "thread", "process"]
+
+
+class OperatorConfig(BaseModel):
+    """Options of an operator: frozen, unknown keys refused, defaults that work, units in the names."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", validate_default=True)
+
+
+@dataclass(frozen=True)
+class NoPorts:
+    """The inputs of a source, the outputs of a sink."""
+
+
+@dataclass(slots=True)
+class Activity:
+    """What an operator did so far; the runtime reads it for plots, the progress bar and the report."""
+
+    num_calls: int = 0  # offloaded
+    num_running: int = 0  # offloaded and not finished
+    busy_ns: int = 0
+    call_ns: list[int] = field(default_factory=list)  # of each offloaded call
+    position_ns: int | None = None  # of a source: log time
+    span_ns: tuple[int, int] | None = None  # of a source: first and last log time
+    warnings: dict[str, int] = field(default_factory=dict)  # message -> how often
+
+
+@dataclass(frozen=True, slots=True)
+class Context:
+    """What the runtime tells a running operator."""
+
+    name: str = "operator"
+    clock: Clock = field(default_factory=WallClock)
+    placement: Placement = "inline"
+    workers: int = 1
+    activity: Activity = field(default_factory=Activity)
+
+
+_context: ContextVar[Context] = ContextVar("mapstream_operator")
+
+
+def context() -> Context:
+    """Return what the runtime told the operator that runs now."""
+    found = _context.get(None)
+    if found is None:
+        found = Context()
+        _context.set(found)
+    return found
+
+
+def set_context(value: Context) -> None:
+    """Tell the tasks that start from here on which operator they are; for runtimes."""
+    _context.set(value)
+
+
+def warn(message: str) -> None:
+    """Count something that the user should know, though the run goes on; shown in the report."""
+    warnings = context().activity.warnings
+    warnings[message] = warnings.get(message, 0) + 1
+
+
+async def offload(function: Callable[..., R], *args: object) -> R:
+    """Call a function where the graph file placed this operator, and wait for its result.
+
+    `inline` and `process` call it here (the whole operator lives in its process), `thread` in a thread.
+    """
+    ctx = context()
+    activity = ctx.activity
+    activity.num_running += 1
+    started_ns = _monotonic_ns()
+    try:
+        if ctx.placement == "thread":
+            return await anyio.to_thread.run_sync(function, *args)
+        return function(*args)
+    finally:
+        activity.num_running -= 1
+        activity.num_calls += 1
+        activity.call_ns.append(_monotonic_ns() - started_ns)
+
+
+async def pipeline(
+    function: Callable[[M], R], messages: Receiver[M], send: Callable[[R], Awaitable[None]]
+) -> None:
+    """Call a stateless function on each message, `workers` at a time, and send the results in order."""
+    ctx = context()
+    if ctx.workers == 1 or ctx.placement != "thread":
+        async for message in messages:
+            await send(await offload(function, message))
+        return
+    async with anyio.create_task_group() as tasks:
+        pending: deque[_Pending[R]] = deque()
+        async for message in messages:
+            pending.append(_Pending())
+            tasks.start_soon(pending[-1].fill, function, message)
+            if len(pending) == ctx.workers:
+                await send(await pending.popleft().result())
+        while pending:
+            await send(await pending.popleft().result())
+
+
+class _Pending(Generic[R]):
+    """A result that is still to come."""
+
+    def __init__(self) -> None:
+        self._done = anyio.Event()
+        self._result: list[R] = []
+
+    async def fill(self, function: Callable[[M], R], message: M) -> None:
+        self._result.append(await offload(function, message))
+        self._done.set()
+
+    async def result(self) -> R:
+        await self._done.wait()
+        return self._result[0]
+
+
+class Operator(ABC, Generic[InputsT, OutputsT]):
+    """A stage of a graph. A subclass names its ports in the brackets and its config in `__init__`."""
+
+    placement: ClassVar[Placement] = "inline"
+    spans_epochs: ClassVar[bool] = False
+
+    @abstractmethod
+    async def run(self, inputs: InputsT, outputs: OutputsT) -> None:
+        """Read inputs and send outputs until the inputs end."""

@@ -1,0 +1,37 @@
+"""Running one operator on lists of messages, for tests of operators here and in other packages."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from mapstream.operators.operator import Context, Operator, set_context
+from mapstream.operators.signature import signature_of
+from mapstream.streams.channel import Channel, Limits, Receiver, Sender
+
+_UNBOUNDED = Limits(capacity=2**62)
+
+
+async def run_operator(
+    operator: Operator[Any, Any], *, run_context: Context | None = None, **inputs: Sequence[Any]
+) -> dict[str, list[Any]]:
+    """Feed each input port its messages, run the operator to its end, return what each output sent."""
+    signature = signature_of(type(operator))
+    receivers: dict[str, Receiver[Any]] = {}
+    for port in signature.inputs:
+        channel: Channel[Any] = Channel(port, _UNBOUNDED)
+        for message in inputs.get(port, ()):
+            await channel.put(message)
+        channel.close()
+        receivers[port] = Receiver(channel, spans_epochs=operator.spans_epochs)
+    outputs: dict[str, Channel[Any]] = {p: Channel(p, _UNBOUNDED) for p in signature.outputs}
+    set_context(run_context or Context(name=type(operator).__name__))
+    await operator.run(
+        signature.inputs_type(**receivers),
+        signature.outputs_type(**{port: Sender([channel]) for port, channel in outputs.items()}),
+    )
+    sent: dict[str, list[Any]] = {}
+    for port, channel in outputs.items():
+        channel.close()
+        sent[port] = [message async for message in Receiver(channel, spans_epochs=True)]
+    return sent

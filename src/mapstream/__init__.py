@@ -1,0 +1,5 @@
+"""mapstream: sensor streams to maps, as a graph of typed operators."""
+
+from importlib.metadata import version
+
+__version__ = version("mapstream")

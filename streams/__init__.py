@@ -1,0 +1,1 @@
+"""What flows between operators and what it flows through."""

@@ -1,0 +1,41 @@
+"""Arrays inside messages: checked once where they enter, read-only ever after."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+
+def frozen(
+    owner: object, field: str, dtype: npt.DTypeLike, shape: tuple[int | None, ...]
+) -> npt.NDArray[Any]:
+    """Make the array in `owner.field` of one dtype and shape, and read-only; None in a shape is any size.
+
+    An array that fits already is not copied, so that messages can be views on a recording.
+
+    Raises:
+        ValueError: If the shape differs; the message names the class, the field and both shapes.
+    """
+    array = np.asarray(getattr(owner, field), dtype=dtype)
+    fits = array.ndim == len(shape) and all(
+        want is None or want == have for want, have in zip(shape, array.shape, strict=True)
+    )
+    if not fits:
+        expected = tuple("N" if want is None else want for want in shape)
+        name = f"{type(owner).__name__}.{field}"
+        raise ValueError(f"{name}: expected shape {expected}, got {array.shape}")
+    if array.flags.writeable:
+        array = array.view()
+        array.flags.writeable = False
+    object.__setattr__(owner, field, array)
+    return array
+
+
+def frozen_optional(
+    owner: object, field: str, dtype: npt.DTypeLike, shape: tuple[int | None, ...]
+) -> None:
+    """Like `frozen`, for a field that may be None."""
+    if getattr(owner, field) is not None:
+        frozen(owner, field, dtype, shape)

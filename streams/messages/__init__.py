@@ -1,0 +1,1 @@
+"""All that flows between operators."""
