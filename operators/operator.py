@@ -46,6 +46,22 @@ class NoPorts:
     """The inputs of a source, the outputs of a sink."""
 
 
+class Ports(dict[str, Any]):
+    """Inputs or outputs whose names come from the config: `outputs["scans"]` is a Sender."""
+
+    def __init__(self, **ports: Any) -> None:  # noqa: ANN401  # ends of channels of any message
+        super().__init__(ports)
+
+
+class DynamicPorts(ABC):
+    """An operator whose ports its config names; its Inputs or Outputs are `Ports`."""
+
+    @classmethod
+    @abstractmethod
+    def ports_for(cls, config: Any) -> tuple[dict[str, Any], dict[str, Any]]:  # noqa: ANN401  # of its own type
+        """Return the message type of each input and of each output; `Any` where it is not known."""
+
+
 @dataclass(slots=True)
 class Activity:
     """What an operator did so far; the runtime reads it for plots, the progress bar and the report."""

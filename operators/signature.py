@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, fields
 from typing import Any, get_args, get_origin, get_type_hints
 
-from mapstream.operators.operator import NoPorts, Operator, OperatorConfig
+from mapstream.operators.operator import DynamicPorts, NoPorts, Operator, OperatorConfig, Ports
 from mapstream.streams.channel import Receiver, Sender
 from mapstream.streams.errors import ConfigError
 
@@ -31,8 +31,12 @@ class Signature:
     outputs: dict[str, Port]
 
 
-def signature_of(operator_type: type[Operator[Any, Any]]) -> Signature:
+def signature_of(
+    operator_type: type[Operator[Any, Any]], config: OperatorConfig | None = None
+) -> Signature:
     """Read the signature of an operator class.
+
+    A class with `DynamicPorts` names its ports from its config; without one it has none.
 
     Raises:
         ConfigError: If the class does not say its ports or its config in the ways of `Operator`.
@@ -44,13 +48,18 @@ def signature_of(operator_type: type[Operator[Any, Any]]) -> Signature:
         raise ConfigError(
             f"{operator_type.__name__}: `config` must be an OperatorConfig, not {config_type}"
         )
+    inputs, outputs = _ports(inputs_type, Receiver), _ports(outputs_type, Sender)
+    if config is not None and issubclass(operator_type, DynamicPorts):
+        inputs_of, outputs_of = operator_type.ports_for(config)
+        inputs |= {name: Port(name, message_type) for name, message_type in inputs_of.items()}
+        outputs |= {name: Port(name, message_type) for name, message_type in outputs_of.items()}
     return Signature(
         operator_type=operator_type,
         config_type=config_type,
         inputs_type=inputs_type,
         outputs_type=outputs_type,
-        inputs=_ports(inputs_type, Receiver),
-        outputs=_ports(outputs_type, Sender),
+        inputs=inputs,
+        outputs=outputs,
     )
 
 
@@ -64,7 +73,7 @@ def _ports_types(operator_type: type) -> tuple[type, type]:
 
 
 def _ports(ports_type: type, end: type) -> dict[str, Port]:
-    if ports_type is NoPorts:
+    if ports_type is NoPorts or ports_type is Ports:
         return {}
     hints = get_type_hints(ports_type)
     ports = {}

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from mapstream.operators.operator import Context, Operator, set_context
+from mapstream.operators.operator import Context, Operator, OperatorConfig, set_context
 from mapstream.operators.signature import signature_of
 from mapstream.streams.channel import Channel, Limits, Receiver, Sender
 
@@ -13,10 +13,17 @@ _UNBOUNDED = Limits(capacity=2**62)
 
 
 async def run_operator(
-    operator: Operator[Any, Any], *, run_context: Context | None = None, **inputs: Sequence[Any]
+    operator: Operator[Any, Any],
+    *,
+    config: OperatorConfig | None = None,
+    run_context: Context | None = None,
+    **inputs: Sequence[Any],
 ) -> dict[str, list[Any]]:
-    """Feed each input port its messages, run the operator to its end, return what each output sent."""
-    signature = signature_of(type(operator))
+    """Feed each input port its messages, run the operator to its end, return what each output sent.
+
+    `config` is needed only for an operator whose config names its ports.
+    """
+    signature = signature_of(type(operator), config)
     receivers: dict[str, Receiver[Any]] = {}
     for port in signature.inputs:
         channel: Channel[Any] = Channel(port, _UNBOUNDED)

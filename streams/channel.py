@@ -13,7 +13,7 @@ import time
 from collections import Counter, deque
 from collections.abc import AsyncIterator, Sequence
 from dataclasses import dataclass, field
-from typing import Generic, Literal, Protocol, TypeVar
+from typing import Any, Generic, Literal, Protocol, TypeVar
 
 import anyio
 import anyio.lowlevel
@@ -58,8 +58,8 @@ class Overflow(Protocol):
     """Where a `spool` channel keeps what it cannot hold, first in, first out."""
 
     def __len__(self) -> int: ...
-    def put(self, item: object) -> bool: ...  # False: no room there either
-    def get(self) -> object: ...
+    def put(self, item: tuple[Any, int]) -> bool: ...  # False: no room there either
+    def get(self) -> tuple[Any, int]: ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -185,8 +185,7 @@ class Channel(Generic[T]):
         if self.limits.max_bytes is not None:
             self._num_bytes -= nbytes(entry[0])
         if self._overflow:
-            item, sequence = self._overflow.get()  # type: ignore[misc]  # what put() was given
-            self._append(item, sequence)
+            self._append(*self._overflow.get())
         self._wake_sender()
         return entry
 

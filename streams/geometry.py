@@ -223,7 +223,8 @@ class SE3:
         """Compose with a transform, or map points (..., 3)."""
         if isinstance(other, SE3):
             return SE3(self.matrix @ other.matrix)
-        return other @ self.R.T + self.t
+        points: Array = other @ self.R.T + self.t
+        return points
 
     def __repr__(self) -> str:
         t, quat = np.round(self.t, 4).tolist(), np.round(self.quat_xyzw, 5).tolist()
