@@ -1,0 +1,1 @@
+"""An operator for mapstream in a package of its own."""
