@@ -5,7 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any
 
-from mapstream.graph.spec import LogSpec, ProfileSpec
+from mapstream.graph.problems import Position
+from mapstream.graph.spec import LogSpec, OnErrorSpec, ProfileSpec
 from mapstream.operators.operator import NoPorts, OperatorConfig, Placement
 from mapstream.operators.signature import Signature
 from mapstream.streams.channel import Limits
@@ -21,6 +22,10 @@ class Node:
     config: OperatorConfig
     placement: Placement = "inline"
     workers: int = 1
+    on_error: OnErrorSpec | None = (
+        None  # None: sources of a live run restart, all else stops the run
+    )
+    position: Position | None = None  # in the graph file
 
     @property
     def is_source(self) -> bool:

@@ -95,6 +95,22 @@ class RunSpec(Spec):
     workers: PositiveInt = 1
 
 
+class OnErrorSpec(Spec):
+    """What happens when an operator raises; `skip` alone is short for `{do: skip}`.
+
+    `skip` counts the error and goes on with the next message, `restart` does so with a new operator, `disable`
+    ends this operator alone. After `max` errors the run stops.
+    """
+
+    do: Literal["stop", "skip", "restart", "disable"] = "stop"
+    max: PositiveInt = 3
+    backoff_s: NonNegativeFloat = 1.0  # before a restart; twice as long each time
+
+
+def _long_on_error(value: object) -> object:
+    return {"do": value} if isinstance(value, str) else value
+
+
 def _long_input(value: object) -> object:
     return {"from": value} if isinstance(value, str) else value
 
@@ -112,6 +128,7 @@ class OperatorSpec(Spec):
     ] = {}
     config: dict[str, Any] = {}
     run: Annotated[RunSpec, BeforeValidator(_long_run)] = RunSpec()
+    on_error: Annotated[OnErrorSpec | None, BeforeValidator(_long_on_error)] = None
     enabled: bool = True
     file: Path | None = None  # of a sub-graph, relative to the file that names it
     with_: Annotated[dict[Name, Any], Field(alias="with")] = {}  # parameters of a sub-graph
@@ -121,7 +138,7 @@ class OperatorSpec(Spec):
         if self.use == SUBGRAPH:
             if self.file is None:
                 raise ValueError("`use: graph` needs `file:`, the graph file to insert")
-            wrong = {"config", "run"} & self.model_fields_set
+            wrong = {"config", "run", "on_error"} & self.model_fields_set
             if wrong:
                 raise ValueError(f"{sorted(wrong)} are for operators; a sub-graph takes `with:`")
         elif {"file", "with_"} & self.model_fields_set:
