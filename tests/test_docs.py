@@ -1,0 +1,148 @@
+"""The documentation is true: its commands run, its snippets work, its tables name tests that exist."""
+
+from __future__ import annotations
+
+import os
+import re
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from mapstream.graph.catalogue import Catalogue
+from mapstream.graph.load import load_graph
+from mapstream.graph.plan import plan
+
+ROOT = Path(__file__).parent.parent
+PAGES = [
+    ROOT / "README.md",
+    *sorted((ROOT / "docs").rglob("*.md")),
+    *sorted((ROOT / "examples").rglob("*.md")),
+]
+FENCE = re.compile(r"^```(\w+)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+LINK = re.compile(r"\]\((?!https?://)([^)#]+)")
+TEST_NAME = re.compile(r"`(tests/[\w/]+\.py)(?:::(\w+))?`")
+OWN_OPERATOR = ROOT / "examples" / "03_own_operator"
+
+
+def blocks(page: Path, language: str) -> list[str]:
+    return [body for kind, body in FENCE.findall(page.read_text()) if kind == language]
+
+
+def pages_with(language: str) -> list[Path]:
+    return [page for page in PAGES if blocks(page, language)]
+
+
+def name_of(page: Path) -> str:
+    return str(page.relative_to(ROOT))
+
+
+@pytest.fixture
+def installed_example(tmp_path: Path) -> Path:
+    """A folder that, on Python's path, makes the example package look installed."""
+    site = tmp_path / "site"
+    info = site / "near_field-0.1.0.dist-info"
+    info.mkdir(parents=True)
+    (site / "near_field").symlink_to(OWN_OPERATOR / "near_field")
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: near-field\nVersion: 0.1.0\n")
+    lines = (OWN_OPERATOR / "pyproject.toml").read_text().splitlines()
+    start = lines.index('[project.entry-points."mapstream.operators"]') + 1
+    entry = lines[start].replace('"', "")
+    (info / "entry_points.txt").write_text(f"[mapstream.operators]\n{entry}\n")
+    return site
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("page", pages_with("console"), ids=name_of)
+def test_commands_on_the_page_succeed(page: Path, tmp_path: Path, installed_example: Path) -> None:
+    """Lines `$ mapstream ...` run in order in one folder; `# exits N` names another exit code than 0."""
+    folder = tmp_path / "work"
+    folder.mkdir()
+    (folder / "examples").symlink_to(ROOT / "examples")
+    environment = {**os.environ, "PYTHONPATH": str(installed_example), "COLUMNS": "200"}
+    for line in "\n".join(blocks(page, "console")).splitlines():
+        if not line.startswith("$ mapstream "):
+            continue  # output, or an installation that the fixture stands for
+        command, _, remark = line.removeprefix("$ mapstream ").partition("# exits ")
+        done = subprocess.run(
+            [sys.executable, "-m", "mapstream.graph.cli", *shlex.split(command)],
+            cwd=folder,
+            env=environment,
+            capture_output=True,
+            text=True,
+            timeout=300,
+            check=False,
+        )
+
+        assert done.returncode == int(remark or 0), f"{line}\n{done.stdout}\n{done.stderr}"
+
+
+@pytest.mark.parametrize("page", pages_with("python"), ids=name_of)
+def test_python_on_the_page_compiles(page: Path) -> None:
+    for body in blocks(page, "python"):
+        compile(body, str(page), "exec")
+
+
+def test_Q1_snippets_of_the_own_operator_run(installed_example: Path) -> None:
+    environment = {**os.environ, "PYTHONPATH": str(installed_example)}
+    body = "\n".join(blocks(OWN_OPERATOR / "README.md", "python"))
+
+    done = subprocess.run(
+        [sys.executable, "-c", body], env=environment, capture_output=True, text=True, check=False
+    )
+
+    assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.parametrize("page", pages_with("yaml"), ids=name_of)
+def test_graphs_on_the_page_can_be_planned(page: Path, tmp_path: Path) -> None:
+    for index, body in enumerate(blocks(page, "yaml")):
+        if "version:" not in body:
+            continue
+        file = tmp_path / f"{index}.yaml"
+        file.write_text(body)
+        recording = {"recording": "drive.mcap"} if "recording: {type: path, help" in body else {}
+
+        plan(load_graph(file, params=recording), Catalogue())
+
+
+@pytest.mark.parametrize("page", PAGES, ids=name_of)
+def test_links_lead_somewhere(page: Path) -> None:
+    missing = [link for link in LINK.findall(page.read_text()) if not (page.parent / link).exists()]
+
+    assert not missing
+
+
+def test_features_name_tests_that_exist() -> None:
+    missing = []
+    for file, function in TEST_NAME.findall((ROOT / "docs" / "features.md").read_text()):
+        path = ROOT / file
+        if not path.exists() or (function and f"def {function}(" not in path.read_text()):
+            missing.append(f"{file}::{function}")
+
+    assert not missing
+
+
+def test_features_that_are_done_say_what_shows_it() -> None:
+    rows = [
+        line.split("|")
+        for line in (ROOT / "docs" / "features.md").read_text().splitlines()
+        if line.startswith("| ")
+    ]
+
+    bare = [
+        cells[1].strip()
+        for cells in rows
+        if cells[3].strip() in ("done", "partly") and not cells[4].strip()
+    ]
+
+    assert not bare
+
+
+def test_the_readme_and_ci_run_the_same_test_command() -> None:
+    command = "python3 -m venv .venv && .venv/bin/pip install -q -e '.[test]' && .venv/bin/pytest"
+
+    assert command in (ROOT / "README.md").read_text()
+    assert command in (ROOT / ".ci" / "run").read_text().splitlines()
