@@ -8,7 +8,7 @@ from difflib import get_close_matches
 
 from mapstream.streams.errors import ConfigError
 
-Path = tuple[str | int, ...]  # of keys, from the top of the file
+KeyPath = tuple[str | int, ...]  # of keys, from the top of the file
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,7 +28,7 @@ class Problem:
     """One thing that is wrong."""
 
     position: Position
-    path: Path
+    path: KeyPath
     message: str
 
     def __str__(self) -> str:
@@ -48,7 +48,7 @@ class GraphError(ConfigError):
         self.problems = tuple(problems)
 
 
-def dotted(path: Path) -> str:
+def dotted(path: KeyPath) -> str:
     """Return `operators.odometry.config.voxel_size_m` for a path of keys."""
     return ".".join(map(str, path))
 

@@ -1,0 +1,93 @@
+"""Which operators there are: those of mapstream by a table, those of other packages by entry points.
+
+Nothing is imported before it is asked for, so a broken plugin is the problem of graphs that use it.
+A package offers operators in its `pyproject.toml`:
+
+    [project.entry-points."mapstream.operators"]
+    my_filter = "my_package.my_filter:MyFilter"
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import cached_property
+from importlib import import_module
+from importlib.metadata import EntryPoint, entry_points
+from typing import Any
+
+from mapstream.graph.problems import did_you_mean
+from mapstream.operators.operator import Operator
+from mapstream.streams.errors import ConfigError
+
+GROUP = "mapstream.operators"
+OperatorType = type[Operator[Any, Any]]
+
+BUILT_IN = {
+    "cloud_sink": "mapstream.operators.sinks.cloud:CloudSink",
+    "gicp_odometry": "mapstream.operators.odometry.gicp_odometry:GicpOdometry",
+    "image_decode": "mapstream.operators.decode.image:ImageDecode",
+    "keyframes": "mapstream.operators.submaps.keyframes:Keyframes",
+    "kiss_odometry": "mapstream.operators.odometry.kiss_odometry:KissOdometry",
+    "lidar_loops": "mapstream.operators.lidar.loops:LidarLoops",
+    "map_store": "mapstream.operators.sinks.map_store:MapStore",
+    "mcap": "mapstream.operators.sources.mcap:McapSource",
+    "mcap_sink": "mapstream.operators.sinks.mcap:McapSink",
+    "optimizer": "mapstream.operators.backend.optimizer:Optimizer",
+    "orb": "mapstream.operators.tracking.orb:Orb",
+    "submap_builder": "mapstream.operators.submaps.submap_builder:SubmapBuilder",
+    "trajectory_sink": "mapstream.operators.sinks.trajectory:TrajectorySink",
+}
+
+
+class Catalogue:
+    """Operators by name.
+
+    Args:
+        extra: Operators that only this catalogue knows, for tests and for programs with their own.
+    """
+
+    def __init__(self, extra: Mapping[str, OperatorType] | None = None) -> None:
+        self._extra = dict(extra or {})
+
+    @cached_property
+    def _plugins(self) -> dict[str, EntryPoint]:
+        return {point.name: point for point in entry_points(group=GROUP)}
+
+    def names(self) -> list[str]:
+        return sorted({*BUILT_IN, *self._plugins, *self._extra})
+
+    def origin(self, name: str) -> str:
+        """Return the package that an operator comes from."""
+        if name in self._extra:
+            return self._extra[name].__module__
+        if name in BUILT_IN:
+            return "mapstream"
+        point = self._plugins[name]
+        return point.dist.name if point.dist else point.value.partition(".")[0]
+
+    def get(self, name: str) -> OperatorType:
+        """Import an operator.
+
+        Raises:
+            ConfigError: If there is none of this name, or its package cannot be imported.
+        """
+        if name in self._extra:
+            return self._extra[name]
+        if name not in BUILT_IN and name not in self._plugins:
+            raise ConfigError(f"no operator {name!r}{did_you_mean(name, self.names())}")
+        try:
+            if name in BUILT_IN:  # a package cannot replace one of ours
+                module, _, attribute = BUILT_IN[name].partition(":")
+                found = getattr(import_module(module), attribute)
+            else:
+                found = self._plugins[name].load()
+        except Exception as error:  # whatever another package does when it is imported
+            reason = f"{type(error).__name__}: {error}"
+            raise ConfigError(
+                f"operator {name!r} of {self.origin(name)} cannot be imported: {reason}"
+            ) from error
+        if not (isinstance(found, type) and issubclass(found, Operator)):
+            raise ConfigError(
+                f"operator {name!r} of {self.origin(name)} is {found!r}, not an Operator class"
+            )
+        return found

@@ -1,0 +1,239 @@
+"""Reading a graph file: parameters, `--set` and sub-graphs put in, every problem with file and line."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+from pydantic import BaseModel, ConfigDict, ValidationError
+
+from mapstream.graph.document import Document, Positions, read_document
+from mapstream.graph.overrides import apply_sets
+from mapstream.graph.params import (
+    BUILT_IN,
+    fill_in,
+    params_used,
+    placeholder,
+    typed_value,
+    value_from_text,
+)
+from mapstream.graph.problems import GraphError, Position, Problem, did_you_mean
+from mapstream.graph.spec import PROFILES, GraphSpec, ParamSpec, ProfileSpec
+from mapstream.graph.subgraphs import Part, expand
+from mapstream.graph.validation import problems_of
+from mapstream.streams.errors import ConfigError
+
+_MAX_FILE_BYTES = 1_000_000
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Options:
+    """What the command line adds to a graph file."""
+
+    params: Mapping[str, str] = field(default_factory=dict)
+    sets: Sequence[str] = ()
+    profile: str = "replay"
+    needs_values: bool = True  # False: stand-ins for parameters without value, to look at a graph
+    environ: Mapping[str, str] = field(default_factory=lambda: os.environ)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Graph:
+    """A graph file with everything put in, and where each key was written."""
+
+    spec: GraphSpec
+    profile: ProfileSpec
+    profile_name: str
+    positions: Positions
+    params_used: frozenset[str]
+
+
+def preset_names() -> list[str]:
+    """Return the names of the graphs that come with mapstream and run without a file."""
+    folder = resources.files("mapstream.graph") / "presets"
+    return sorted(
+        f.name.removesuffix(".yaml") for f in folder.iterdir() if f.name.endswith(".yaml")
+    )
+
+
+def load_graph(graph: str | Path, options: Options | None = None) -> Graph:
+    """Read a graph file, or a preset by its name.
+
+    Raises:
+        ConfigError: If there is no such graph.
+        GraphError: If it has problems: all that were found, each with file, line and key.
+    """
+    path = Path(graph).expanduser()
+    if path.suffix in (".yaml", ".yml") or path.is_file():
+        return parse_graph(_text(path), path, options)
+    names = preset_names()
+    if str(graph) not in names:
+        hint = did_you_mean(str(graph), names)
+        raise ConfigError(f"no graph file and no preset {str(graph)!r}{hint}")
+    preset = resources.files("mapstream.graph") / "presets" / f"{graph}.yaml"
+    with resources.as_file(preset) as file:
+        return parse_graph(file.read_text(encoding="utf-8"), file, options)
+
+
+def parse_graph(
+    text: str, path: Path = Path("graph.yaml"), options: Options | None = None
+) -> Graph:
+    """Read a graph from text; `path` names it in messages and leads to its sub-graphs.
+
+    Raises:
+        GraphError: If it has problems.
+    """
+    options = options or Options()
+    used: set[str] = set()
+
+    def read_part(file: Path, given: Mapping[str, Any]) -> Part:
+        return _part(read_document(_text(file), _shown(file)), file, _Values(options, given))
+
+    document = read_document(text, _shown(path))
+    used |= params_used(document.data)
+    part = _part(document, path.resolve(), _Values(options, None))
+    if part.spec.inputs:
+        message = "is a part of other graphs (it has inputs); use it with `use: graph`"
+        raise GraphError([Problem(part.positions.of(("inputs",)), (), message)])
+    spec = apply_sets(expand(part, read_part), options.sets, part.positions)
+    return Graph(
+        spec=spec,
+        profile=_profile(spec, options.profile),
+        profile_name=options.profile,
+        positions=part.positions,
+        params_used=frozenset(used),
+    )
+
+
+def _text(path: Path) -> str:
+    try:
+        if path.stat().st_size > _MAX_FILE_BYTES:
+            raise ConfigError(f"{path}: over {_MAX_FILE_BYTES} bytes: not a graph file")
+        return path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path}: cannot be read: {error}") from None
+
+
+def _shown(path: Path) -> str:
+    """Return a path as messages show it: from the working directory if it lies there."""
+    try:
+        return str(path.absolute().relative_to(Path.cwd()))
+    except ValueError:
+        return str(path)
+
+
+class _Params(BaseModel):
+    """The one part of a file that must be right before the rest can be looked at."""
+
+    model_config = ConfigDict(extra="ignore")
+
+    params: dict[str, ParamSpec] = {}
+
+
+@dataclass(frozen=True, slots=True)
+class _Values:
+    """Where the values of parameters come from: the command line, or `with:` of a sub-graph."""
+
+    options: Options
+    given: Mapping[str, Any] | None
+
+    def of(
+        self, specs: Mapping[str, ParamSpec], used: set[str], document: Document
+    ) -> dict[str, Any]:
+        """Return the values of all parameters.
+
+        Raises:
+            GraphError: If a value is missing or wrong, or belongs to no parameter.
+        """
+        built_in = {name: spec for name, spec in BUILT_IN.items() if name in used}
+        known = built_in | dict(specs)
+        problems = self._unknown(known, document.positions)
+        values = {}
+        for name, spec in known.items():
+            try:
+                values[name] = self._value(name, spec)
+            except ValueError as error:
+                path = ("params", name)
+                problems.append(Problem(document.positions.of(path), path, str(error)))
+        if problems:
+            raise GraphError(problems)
+        return values
+
+    def _unknown(self, known: Mapping[str, ParamSpec], positions: Positions) -> list[Problem]:
+        if self.given is not None:
+            place = Position(positions.source)
+            return [
+                Problem(place, ("params",), f"no parameter {name!r}{did_you_mean(name, known)}")
+                for name in self.given
+                if name not in known
+            ]
+        return [
+            Problem(
+                Position(f"--param {name}={text}"),
+                (),
+                f"{positions.source} has no parameter {name!r}{did_you_mean(name, known)}",
+            )
+            for name, text in self.options.params.items()
+            if name not in known
+        ]
+
+    def _value(self, name: str, spec: ParamSpec) -> Any:  # noqa: ANN401  # as spec says
+        options = self.options
+        if self.given is not None and name in self.given:
+            return typed_value(name, spec, self.given[name])
+        if name in options.params and (self.given is None or name in BUILT_IN):
+            return value_from_text(name, spec, options.params[name])
+        if spec.env is not None and spec.env in options.environ:
+            return value_from_text(name, spec, options.environ[spec.env])
+        if spec.default is not None:
+            return typed_value(name, spec, spec.default)
+        if not options.needs_values:
+            return placeholder(name, spec)
+        raise ValueError(f"no value{_how_to_give(name, spec)}")
+
+
+def _how_to_give(name: str, spec: ParamSpec) -> str:
+    ways = {"recording": "RECORDING after the graph", "map": "--map DIR"}
+    how = ways.get(name, f"--param {name}=VALUE")
+    env = f", or set {spec.env}" if spec.env else ""
+    about = f" ({spec.help})" if spec.help else ""
+    return f"; give {how}{env}{about}"
+
+
+def _part(document: Document, path: Path, values: _Values) -> Part:
+    """Check one file and put its parameters in."""
+    data, positions = document.data, document.positions
+    if not isinstance(data, dict):
+        raise GraphError([Problem(Position(positions.source, 1), (), "expected keys and values")])
+    try:
+        params = _Params.model_validate(data).params
+    except ValidationError as error:
+        raise GraphError(problems_of(error, GraphSpec, (), positions)) from None
+    filled, problems = fill_in(document, values.of(params, params_used(data), document))
+    if problems:
+        raise GraphError(problems)
+    try:
+        return Part(GraphSpec.model_validate(filled), positions, path)
+    except ValidationError as error:
+        raise GraphError(problems_of(error, GraphSpec, (), positions)) from None
+
+
+def _profile(spec: GraphSpec, name: str) -> ProfileSpec:
+    """Return a profile; what a file's own one leaves out is as in the built-in of that name, or `replay`."""
+    own = spec.profiles.get(name)
+    if own is None and name not in PROFILES:
+        hint = did_you_mean(name, {*spec.profiles, *PROFILES})
+        raise ConfigError(f"--profile {name}: no such profile{hint}")
+    base = PROFILES.get(name, PROFILES["replay"])
+    if own is None:
+        return base
+    clock = base.clock.model_copy(
+        update={key: getattr(own.clock, key) for key in own.clock.model_fields_set}
+    )
+    return ProfileSpec(
+        clock=clock, edges=own.edges.over(base.edges), sources=own.sources.over(base.sources)
+    )
