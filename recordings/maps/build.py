@@ -1,0 +1,208 @@
+"""How maps grow: missions, submaps, edges, poses, resources. Every function returns a new map."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
+
+import numpy as np
+import numpy.typing as npt
+
+from mapstream.recordings.maps.ids import derived_id, id_array, id_bytes, vertex_id
+from mapstream.recordings.maps.model import Map
+from mapstream.recordings.maps.rows import concatenate
+from mapstream.recordings.maps.tables import Edges, Missions, Resources, Vertices
+from mapstream.streams.errors import MapError
+from mapstream.streams.geometry import SE3
+from mapstream.streams.messages.estimates import Keyframe, RelativePose, Submap
+from mapstream.streams.messages.sensors import FloatArray, IntArray, RecordRef
+
+
+def new_mission(map_: Map, mission_id: str, *, name: str = "", sensors: str = "{}") -> Map:
+    """Return the map with one more mission, which has no vertices yet.
+
+    The first mission of a map defines the map frame; where later ones lie is not known.
+
+    Raises:
+        MapError: If the map has this mission.
+    """
+    if mission_id in [map_.mission_id(row) for row in range(len(map_.missions))]:
+        raise MapError(f"mission {mission_id} is in the map already")
+    mission = Missions(
+        id=id_array([id_bytes(mission_id)]),
+        name=np.array([name], dtype=object),
+        T_map_mission=np.eye(4)[None],
+        is_base_frame_known=np.array([len(map_.missions) == 0]),
+        sensors=np.array([sensors], dtype=object),
+    )
+    return replace(map_, missions=concatenate([map_.missions, mission]))
+
+
+def append_submap(map_: Map, submap: Submap, *, mission_name: str = "") -> Map:
+    """Return the map with a submap's keyframes, edges and references at the end of its mission.
+
+    The first keyframe of every submap but the first is the mission's newest vertex and is not added again.
+    From there on odometry is carried on, so that the new vertices follow a mission that was optimised.
+
+    Raises:
+        MapError: If the submap is not the next one of its mission, or an edge ends outside the mission.
+    """
+    known = [map_.mission_id(row) for row in range(len(map_.missions))]
+    if submap.mission_id not in known:
+        map_ = new_mission(map_, submap.mission_id, name=mission_name)
+    mission_row = map_.mission_row(submap.mission_id)
+    T_mission_odom = _continued(map_, mission_row, submap)
+    added = submap.keyframes[1:] if len(map_.vertices_of(mission_row)) else submap.keyframes
+    first_new = len(map_.vertices)
+    vertices = _vertices(added, id_bytes(submap.mission_id), mission_row, T_mission_odom)
+    map_ = replace(map_, vertices=concatenate([map_.vertices, vertices]))
+    records = [(first_new + at, r) for at, keyframe in enumerate(added) for r in keyframe.records]
+    return add_edges(add_records(map_, records), submap.edges)
+
+
+def _continued(map_: Map, mission_row: int, submap: Submap) -> SE3:
+    """Return T_mission_odom by which the submap follows on what the map holds."""
+    rows = map_.vertices_of(mission_row)
+    first = submap.keyframes[0]
+    if not len(rows):
+        if submap.index != 0:
+            where = f"submap {submap.index} of mission {submap.mission_id}"
+            raise MapError(f"{where}: the map has no vertex of this mission; append submap 0 first")
+        return SE3.identity()
+    newest = int(rows[-1])
+    stamp_ns = int(map_.vertices.stamp_ns[newest])
+    if first.stamp_ns != stamp_ns:
+        raise MapError(
+            f"submap {submap.index} of mission {submap.mission_id} begins at {first.stamp_ns} ns,"
+            f" but the mission ends at {stamp_ns} ns; append submaps in order, each once"
+        )
+    return map_.vertices.T_mission_base_of(newest) @ first.odometry.T_odom_base.inverse()
+
+
+def _vertices(
+    keyframes: Sequence[Keyframe], mission: bytes, mission_row: int, T_mission_odom: SE3
+) -> Vertices:
+    odometry = [keyframe.odometry for keyframe in keyframes]
+    poses_odom = np.array([o.T_odom_base.matrix for o in odometry]).reshape(-1, 4, 4)
+    velocity_odom = _stacked([o.velocity_mps for o in odometry])
+    return Vertices(
+        id=id_array(vertex_id(mission, keyframe.stamp_ns) for keyframe in keyframes),
+        mission=np.full(len(keyframes), mission_row),
+        stamp_ns=np.array([keyframe.stamp_ns for keyframe in keyframes], dtype=np.int64),
+        T_mission_base=T_mission_odom.matrix @ poses_odom,
+        velocity_mps=velocity_odom @ T_mission_odom.R.T,
+        gyro_bias_radps=_stacked([o.gyro_bias_radps for o in odometry]),
+        accel_bias_mps2=_stacked([o.accel_bias_mps2 for o in odometry]),
+    )
+
+
+def _stacked(vectors: Iterable[FloatArray | None]) -> FloatArray:
+    rows = [np.full(3, np.nan) if vector is None else vector for vector in vectors]
+    return np.array(rows, dtype=np.float64).reshape(-1, 3)
+
+
+def add_edges(map_: Map, edges: Sequence[RelativePose]) -> Map:
+    """Return the map with measured transforms between its vertices.
+
+    Raises:
+        MapError: If there is no vertex where an edge begins or ends.
+    """
+    if not edges:
+        return map_
+    rows_a = _rows_at(map_, [e.mission_a for e in edges], [e.stamp_a_ns for e in edges])
+    rows_b = _rows_at(map_, [e.mission_b for e in edges], [e.stamp_b_ns for e in edges])
+    added = Edges(
+        id=np.zeros((len(edges), 16), dtype=np.uint8),
+        kind=np.array([e.kind for e in edges], dtype=object),
+        vertex_a=rows_a,
+        vertex_b=rows_b,
+        T_a_b=np.array([e.T_a_b.matrix for e in edges]),
+        covariance=np.array([e.covariance for e in edges]),
+        is_switchable=np.array([e.is_switchable for e in edges]),
+        source=np.array([e.source for e in edges], dtype=object),
+    )
+    return append_edges(map_, added)
+
+
+def append_edges(map_: Map, added: Edges) -> Map:
+    """Return the map with rows of edges, which get their ids here.
+
+    The n-th edge of one kind and source between two vertices has the same id wherever it is added.
+    """
+    old = map_.edges
+    near = np.isin(old.vertex_a, added.vertex_a)
+    columns = (old.kind[near], old.source[near], old.vertex_a[near], old.vertex_b[near])
+    seen: Counter[tuple[str, str, int, int]] = Counter(zip(*columns, strict=True))
+    ids = []
+    vertices = map_.vertices.id
+    for key in zip(added.kind, added.source, added.vertex_a, added.vertex_b, strict=True):
+        kind, source, a, b = key
+        end = vertices[b].tobytes() if b >= 0 else b""
+        ids.append(derived_id("edge", kind, source, vertices[a].tobytes(), end, seen[key]))
+        seen[key] += 1
+    return replace(map_, edges=concatenate([old, replace(added, id=id_array(ids))]))
+
+
+def _rows_at(map_: Map, missions: Sequence[str], stamps_ns: Sequence[int]) -> IntArray:
+    named, stamps = np.array(missions, dtype=object), np.array(stamps_ns, dtype=np.int64)
+    rows = np.empty(len(stamps), dtype=np.int64)
+    for mission in dict.fromkeys(missions):
+        here = named == mission
+        rows[here] = map_.vertex_rows(mission, stamps[here])
+    return rows
+
+
+def with_poses(map_: Map, vertex_rows: npt.NDArray[np.int64], T_mission_base: npt.ArrayLike) -> Map:
+    """Return the map with other poses (N, 4, 4) in these rows (N,) of its vertices."""
+    poses = map_.vertices.T_mission_base.copy()
+    poses[vertex_rows] = T_mission_base
+    return replace(map_, vertices=replace(map_.vertices, T_mission_base=poses))
+
+
+def anchored(map_: Map, mission_row: int, T_map_mission: SE3) -> Map:
+    """Return the map with a mission whose place in the map frame is now known."""
+    frames = map_.missions.T_map_mission.copy()
+    is_known = map_.missions.is_base_frame_known.copy()
+    frames[mission_row], is_known[mission_row] = T_map_mission.matrix, True
+    missions = replace(map_.missions, T_map_mission=frames, is_base_frame_known=is_known)
+    return replace(map_, missions=missions)
+
+
+def add_records(map_: Map, records: Sequence[tuple[int, RecordRef]]) -> Map:
+    """Return the map with references into recordings, each with the row of its vertex."""
+    return add_resources(
+        map_,
+        vertex_rows=np.array([row for row, _ in records], dtype=np.int64),
+        kind="record",
+        paths=[record.path for _, record in records],
+        topics=[record.topic for _, record in records],
+        log_ns=[record.log_ns for _, record in records],
+    )
+
+
+def add_resources(
+    map_: Map,
+    *,
+    vertex_rows: npt.NDArray[np.int64],
+    kind: str,
+    paths: Sequence[str],
+    topics: Sequence[str] | None = None,
+    log_ns: Sequence[int] | None = None,
+) -> Map:
+    """Return the map with references of vertices (N,) to files of its folder, or into recordings."""
+    if not paths:
+        return map_
+    topics = topics or [""] * len(paths)
+    log_ns = log_ns or [0] * len(paths)
+    owners = [row.tobytes() for row in map_.vertices.id[vertex_rows]]
+    places = zip(owners, paths, topics, log_ns, strict=True)
+    added = Resources(
+        id=id_array(derived_id("resource", kind, *place) for place in places),
+        vertex=vertex_rows,
+        kind=np.array([kind] * len(paths), dtype=object),
+        path=np.array(paths, dtype=object),
+        topic=np.array(topics, dtype=object),
+        log_ns=np.array(log_ns, dtype=np.int64),
+    )
+    return replace(map_, resources=concatenate([map_.resources, added]))

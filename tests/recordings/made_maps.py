@@ -1,0 +1,116 @@
+"""Maps and submaps made by hand, for tests of what maps can do."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+
+from mapstream.recordings.maps.build import append_edges, append_submap
+from mapstream.recordings.maps.ids import derived_id, id_array
+from mapstream.recordings.maps.model import Map
+from mapstream.recordings.maps.tables import Edges, ImuSamples, Landmarks, Observations
+from mapstream.streams.geometry import SE3
+from mapstream.streams.messages.estimates import (
+    Keyframe,
+    Odometry,
+    PointCloud,
+    RelativePose,
+    Submap,
+)
+from mapstream.streams.messages.sensors import RecordRef
+
+MISSION, OTHER_MISSION = "0f" * 16, "a0" * 16
+STEP_NS = 500_000_000
+STEP = SE3.exp([0.0, 0.01, 0.05, 1.0, 0.0, 0.02])
+COVARIANCE = np.diag([1e-4, 1e-4, 1e-4, 1e-2, 1e-2, 1e-2])
+
+
+def keyframe(index: int, *, with_cloud: bool = False) -> Keyframe:
+    """The index-th keyframe of a robot that goes on by the same step."""
+    stamp_ns = 1_000 + index * STEP_NS
+    pose = SE3(np.linalg.matrix_power(STEP.matrix, index))
+    cloud = None
+    if with_cloud:
+        points = np.random.default_rng(index).normal(size=(50, 3)).astype(np.float32)
+        cloud = PointCloud(stamp_ns=stamp_ns, points=points, intensity=points[:, 0])
+    odometry = Odometry(
+        stamp_ns=stamp_ns, T_odom_base=pose, velocity_mps=pose.R @ np.array([2.0, 0, 0])
+    )
+    record = RecordRef(path="drive.mcap", topic="/points", log_ns=stamp_ns + 5)
+    return Keyframe(stamp_ns=stamp_ns, odometry=odometry, cloud=cloud, records=(record,))
+
+
+def edge(a: Keyframe, b: Keyframe, mission: str = MISSION) -> RelativePose:
+    return RelativePose(
+        kind="odometry",
+        mission_a=mission,
+        stamp_a_ns=a.stamp_ns,
+        mission_b=mission,
+        stamp_b_ns=b.stamp_ns,
+        T_a_b=a.odometry.T_odom_base.inverse() @ b.odometry.T_odom_base,
+        covariance=COVARIANCE,
+        source="odometry",
+    )
+
+
+def submaps(cuts: list[int], mission: str = MISSION, *, with_clouds: bool = False) -> list[Submap]:
+    """Submaps that end at these keyframes; each but the first begins where the one before ends."""
+    made = []
+    for index, (start, end) in enumerate(zip([0, *cuts], cuts, strict=False)):
+        frames = tuple(keyframe(i, with_cloud=with_clouds) for i in range(start, end + 1))
+        edges = tuple(edge(a, b, mission) for a, b in pairwise(frames))
+        is_last = end == cuts[-1]
+        made.append(
+            Submap(mission_id=mission, index=index, keyframes=frames, edges=edges, is_last=is_last)
+        )
+    return made
+
+
+def line_map(num_vertices: int, mission: str = MISSION) -> Map:
+    """A map of one mission with odometry edges between neighbours."""
+    [submap] = submaps([num_vertices - 1], mission)
+    return append_submap(Map.empty(), submap, mission_name="line")
+
+
+def full_map() -> Map:
+    """A clean map with something in every table but the journal."""
+    map_ = line_map(6)
+    imu_rows = np.arange(5)
+    imu = Edges(
+        id=np.zeros((5, 16), dtype=np.uint8),
+        kind=np.array(["imu"] * 5, dtype=object),
+        vertex_a=imu_rows,
+        vertex_b=imu_rows + 1,
+    )
+    map_ = append_edges(map_, imu)
+    first_imu = len(map_.edges) - 5
+    start_ns = map_.vertices.stamp_ns[imu_rows]
+    samples = ImuSamples(
+        edge=np.repeat(first_imu + imu_rows, 3),
+        stamp_ns=(start_ns[:, None] + np.array([0, STEP_NS // 2, STEP_NS])).reshape(-1),
+        gyro_radps=np.zeros((15, 3)),
+        accel_mps2=np.tile([0.0, 0.0, 9.81], (15, 1)),
+    )
+    landmarks = Landmarks(
+        id=id_array(derived_id("landmark", n) for n in range(4)),
+        kind=np.array(["visual", "visual", "lidar", "object"], dtype=object),
+        label=np.array(["", "", "", "chair"], dtype=object),
+        vertex=np.array([0, 1, 1, 2]),
+        p_base=np.arange(12.0).reshape(4, 3),
+        covariance=np.tile(np.eye(3) * 0.01, (4, 1, 1)),
+        payload=np.array([b"", b"", b"", b"\x00\xffhull"], dtype=object),
+    )
+    observations = Observations(
+        vertex=np.array([0, 1, 2, 3, 3]),
+        landmark=np.array([0, 0, 2, 3, -1]),
+        sensor=np.array(["camera", "camera", "lidar", "camera", "camera"], dtype=object),
+        keypoint_px=np.ones((5, 2), dtype=np.float32),
+    )
+    return replace(map_, imu=samples, landmarks=landmarks, observations=observations)
+
+
+def files_under(folder: Path) -> dict[str, bytes]:
+    return {str(p.relative_to(folder)): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
