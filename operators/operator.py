@@ -17,12 +17,14 @@ from collections.abc import Awaitable, Callable
 from contextvars import ContextVar
 from dataclasses import dataclass, field
 from time import monotonic_ns as _monotonic_ns
+from time import thread_time_ns
 from typing import Any, ClassVar, Generic, Literal, TypeVar
 
 import anyio
 import anyio.to_thread
 from pydantic import BaseModel, ConfigDict
 
+from mapstream.operators.durations import Durations
 from mapstream.streams.channel import Receiver
 from mapstream.streams.clock import Clock, WallClock
 from mapstream.streams.messages.sensors import Message
@@ -66,10 +68,11 @@ class DynamicPorts(ABC):
 class Activity:
     """What an operator did so far; the runtime reads it for plots, the progress bar and the report."""
 
-    num_calls: int = 0  # offloaded
+    calls: Durations = field(default_factory=Durations)  # offloaded
     num_running: int = 0  # offloaded and not finished
-    busy_ns: int = 0
-    call_ns: list[int] = field(default_factory=list)  # of each offloaded call
+    loop_ns: int = 0  # time on the event loop, inline calls included
+    cpu_ns: int = 0  # processor time of the loop's and the calls' threads
+    rss_bytes: int | None = None  # memory of the operator's own process, if it has one
     position_ns: int | None = None  # of a source: log time
     span_ns: tuple[int, int] | None = None  # of a source: first and last log time
     warnings: dict[str, int] = field(default_factory=dict)  # message -> how often
@@ -83,6 +86,9 @@ class Context:
     clock: Clock = field(default_factory=WallClock)
     placement: Placement = "inline"
     workers: int = 1
+    limiter: anyio.CapacityLimiter | None = (
+        None  # of the threads that this operator may use at a time
+    )
     activity: Activity = field(default_factory=Activity)
 
 
@@ -119,13 +125,31 @@ async def offload(function: Callable[..., R], *args: object) -> R:
     activity.num_running += 1
     started_ns = _monotonic_ns()
     try:
-        if ctx.placement == "thread":
-            return await anyio.to_thread.run_sync(function, *args)
-        return function(*args)
+        if ctx.placement != "thread":
+            return function(*args)
+        call = _ThreadCall(function)
+        try:
+            return await anyio.to_thread.run_sync(call, *args, limiter=ctx.limiter)
+        finally:
+            activity.cpu_ns += call.cpu_ns
     finally:
         activity.num_running -= 1
-        activity.num_calls += 1
-        activity.call_ns.append(_monotonic_ns() - started_ns)
+        activity.calls.add(_monotonic_ns() - started_ns)
+
+
+class _ThreadCall(Generic[R]):
+    """A function that notes the processor time its thread spends in it."""
+
+    def __init__(self, function: Callable[..., R]) -> None:
+        self._function = function
+        self.cpu_ns = 0
+
+    def __call__(self, *args: object) -> R:
+        started_ns = thread_time_ns()
+        try:
+            return self._function(*args)
+        finally:
+            self.cpu_ns = thread_time_ns() - started_ns
 
 
 async def pipeline(
