@@ -20,6 +20,7 @@ from mapstream.graph.problems import GraphError, KeyPath, Position, Problem
 _MAX_VALUES = 100_000
 _MAX_DEPTH = 50
 _STANDARD = "tag:yaml.org,2002:"
+_KINDS = {"map", "seq", "str", "bool", "int", "float", "null", "timestamp", "merge", "value"}
 
 
 @dataclass(slots=True)
@@ -102,14 +103,17 @@ class _Reader:
             limit = f"more than {_MAX_VALUES} values, or {_MAX_DEPTH} levels"
             raise GraphError([Problem(self._place(node), path[:3], f"{limit}: not a graph")])
         self.positions.places.setdefault(path, self._place(node))
-        if not str(node.tag).startswith(_STANDARD):
+        kind = str(node.tag).removeprefix(_STANDARD)
+        if kind not in _KINDS:
             self._refuse(node, path, f"tag {node.tag!r} is not allowed here")
             return None
         if isinstance(node, MappingNode):
             return self._map(node, path)
         if isinstance(node, SequenceNode):
             return [self.plain(child, (*path, i)) for i, child in enumerate(node.value)]
-        return self._scalar(node)
+        if kind in ("bool", "int", "float", "null"):
+            return self._yaml.constructor.construct_object(node)
+        return node.value  # text; dates stay text, as in YAML 1.2's core schema
 
     def _map(self, node: MappingNode, path: KeyPath) -> dict[str, Any]:
         result: dict[str, Any] = {}
@@ -126,12 +130,6 @@ class _Reader:
             self.positions.places[key_path] = self._place(key_node)
             result[key] = self.plain(value_node, key_path)
         return result
-
-    def _scalar(self, node: Node) -> Any:  # noqa: ANN401  # what the file holds
-        kind = str(node.tag).removeprefix(_STANDARD)
-        if kind in ("bool", "int", "float", "null"):
-            return self._yaml.constructor.construct_object(node)
-        return node.value  # text; dates stay text, as in YAML 1.2's core schema
 
     def _refuse(self, node: Node, path: KeyPath, message: str) -> None:
         self.problems.append(Problem(self._place(node), path, message))

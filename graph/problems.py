@@ -56,7 +56,7 @@ def dotted(path: KeyPath) -> str:
 def did_you_mean(word: str, known: Iterable[str]) -> str:
     """Return a hint on a word that is not among the known ones; it starts with `; `."""
     names = sorted(known)
-    close = get_close_matches(word, names, n=1, cutoff=0.6)
+    close = get_close_matches(word, names, n=1, cutoff=0.5)
     if close:
         return f"; did you mean {close[0]!r}?"
     shown = ", ".join(names[:12]) + (", ..." if len(names) > 12 else "")
