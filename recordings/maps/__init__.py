@@ -1,5 +1,6 @@
 """What a run leaves behind: the map, its tables, its files and its rules."""
 
 from mapstream.recordings.maps.model import Map
+from mapstream.recordings.maps.store import load_map, save_map
 
-__all__ = ["Map"]
+__all__ = ["Map", "load_map", "save_map"]
