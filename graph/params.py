@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 from pydantic import ConfigDict, TypeAdapter, ValidationError
@@ -52,6 +53,8 @@ def typed_value(name: str, spec: ParamSpec, value: object) -> Any:  # noqa: ANN4
     except ValidationError:
         expected = f"expected {spec.type}, found {describe(value)}"
         raise ValueError(f"parameter {name!r}: {expected}") from None
+    if spec.type == "path":
+        return str(Path(result).expanduser())
     for limit, is_outside, word in (
         (spec.min, spec.min is not None and result < spec.min, "at least"),
         (spec.max, spec.max is not None and result > spec.max, "at most"),

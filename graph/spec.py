@@ -20,6 +20,7 @@ from mapstream.operators.operator import Placement
 from mapstream.streams.channel import Limits, Policy
 
 SUBGRAPH = "graph"  # `use: graph` stands for the operators of another file
+ErrorAction = Literal["stop", "skip", "restart", "disable"]
 NAME_PATTERN = r"^[A-Za-z][A-Za-z0-9_]*$"
 Name = Annotated[str, Field(pattern=NAME_PATTERN)]
 
@@ -102,7 +103,7 @@ class OnErrorSpec(Spec):
     ends this operator alone. After `max` errors the run stops.
     """
 
-    do: Literal["stop", "skip", "restart", "disable"] = "stop"
+    do: ErrorAction = "stop"
     max: PositiveInt = 3
     backoff_s: NonNegativeFloat = 1.0  # before a restart; twice as long each time
 
@@ -124,11 +125,22 @@ class OperatorSpec(Spec):
 
     use: str
     in_: Annotated[
-        dict[Name, Annotated[InputSpec, BeforeValidator(_long_input)]], Field(alias="in")
+        dict[
+            Name,
+            Annotated[
+                InputSpec, BeforeValidator(_long_input, json_schema_input_type=str | InputSpec)
+            ],
+        ],
+        Field(alias="in"),
     ] = {}
     config: dict[str, Any] = {}
-    run: Annotated[RunSpec, BeforeValidator(_long_run)] = RunSpec()
-    on_error: Annotated[OnErrorSpec | None, BeforeValidator(_long_on_error)] = None
+    run: Annotated[
+        RunSpec, BeforeValidator(_long_run, json_schema_input_type=Placement | RunSpec)
+    ] = RunSpec()
+    on_error: Annotated[
+        OnErrorSpec | None,
+        BeforeValidator(_long_on_error, json_schema_input_type=ErrorAction | OnErrorSpec | None),
+    ] = None
     enabled: bool = True
     file: Path | None = None  # of a sub-graph, relative to the file that names it
     with_: Annotated[dict[Name, Any], Field(alias="with")] = {}  # parameters of a sub-graph
