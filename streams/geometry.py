@@ -68,7 +68,8 @@ def quat_xyzw_from_rotation(R: npt.ArrayLike) -> Array:
     best = np.argmax(squares, axis=-1)[..., None, None]
     quat = np.take_along_axis(candidates, best, axis=-2)[..., 0, :]
     quat = quat / np.linalg.norm(quat, axis=-1, keepdims=True)
-    return np.where(quat[..., 3:] < 0, -quat, quat)
+    positive: Array = np.where(quat[..., 3:] < 0, -quat, quat)
+    return positive
 
 
 def so3_exp(w: npt.ArrayLike) -> Array:
