@@ -56,8 +56,13 @@ class FolderLock:
         )  # gives the lock back; the file stays, or two runs could lock two files
 
 
-def write_whole(path: Path, data: bytes) -> None:
+def write_whole(path: Path, data: bytes | memoryview, *, is_durable: bool = True) -> None:
     """Write a file that is there with all its bytes or, after a failure, as it was before.
+
+    Args:
+        path: The file; one with this name is replaced.
+        data: Its bytes.
+        is_durable: Wait for the disk, so that the file also survives a loss of power.
 
     Raises:
         OSError: If the disk is full, and for all else that a disk does.
@@ -66,13 +71,15 @@ def write_whole(path: Path, data: bytes) -> None:
     try:
         with part.open("wb") as file:
             file.write(data)
-            file.flush()
-            os.fsync(file.fileno())
+            if is_durable:
+                file.flush()
+                os.fsync(file.fileno())
         part.replace(path)
     except OSError:
         part.unlink(missing_ok=True)
         raise
-    sync_folder(path.parent)
+    if is_durable:
+        sync_folder(path.parent)
 
 
 def sync_folder(folder: Path) -> None:
