@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import dataclasses
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -31,17 +32,6 @@ _MAX_FILE_BYTES = 1_000_000
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Options:
-    """What the command line adds to a graph file."""
-
-    params: Mapping[str, str] = field(default_factory=dict)
-    sets: Sequence[str] = ()
-    profile: str = "replay"
-    needs_values: bool = True  # False: stand-ins for parameters without value, to look at a graph
-    environ: Mapping[str, str] = field(default_factory=lambda: os.environ)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
 class Graph:
     """A graph file with everything put in, and where each key was written."""
 
@@ -60,52 +50,73 @@ def preset_names() -> list[str]:
     )
 
 
-def load_graph(graph: str | Path, options: Options | None = None) -> Graph:
+def load_graph(
+    graph: str | Path,
+    *,
+    params: Mapping[str, str] | None = None,
+    sets: Sequence[str] = (),
+    profile: str = "replay",
+    needs_values: bool = True,
+) -> Graph:
     """Read a graph file, or a preset by its name.
 
+    Args:
+        graph: A file `*.yaml`, or the name of a preset.
+        params: Values of the graph's parameters, as text.
+        sets: Options of single operators, `OPERATOR.KEY=VALUE`.
+        profile: One of the graph's profiles, or `replay` or `live`.
+        needs_values: If False, parameters without a value get a stand-in: to look, not to run.
+
     Raises:
-        ConfigError: If there is no such graph.
+        ConfigError: If there is no such graph or profile.
         GraphError: If it has problems: all that were found, each with file, line and key.
     """
     path = Path(graph).expanduser()
+    given = _Given(params or {}, needs_values=needs_values)
     if path.suffix in (".yaml", ".yml") or path.is_file():
-        return parse_graph(_text(path), path, options)
+        return _graph(_text(path), path, given, sets, profile)
     names = preset_names()
     if str(graph) not in names:
         hint = did_you_mean(str(graph), names)
         raise ConfigError(f"no graph file and no preset {str(graph)!r}{hint}")
     preset = resources.files("mapstream.graph") / "presets" / f"{graph}.yaml"
     with resources.as_file(preset) as file:
-        return parse_graph(file.read_text(encoding="utf-8"), file, options)
+        return _graph(_text(file), file, given, sets, profile)
 
 
 def parse_graph(
-    text: str, path: Path = Path("graph.yaml"), options: Options | None = None
+    text: str,
+    path: Path = Path("graph.yaml"),
+    *,
+    params: Mapping[str, str] | None = None,
+    sets: Sequence[str] = (),
+    profile: str = "replay",
 ) -> Graph:
-    """Read a graph from text; `path` names it in messages and leads to its sub-graphs.
+    """Read a graph from text, as `load_graph`; `path` names it in messages and leads to its sub-graphs.
 
     Raises:
         GraphError: If it has problems.
     """
-    options = options or Options()
-    used: set[str] = set()
+    return _graph(text, path, _Given(params or {}), sets, profile)
 
-    def read_part(file: Path, given: Mapping[str, Any]) -> Part:
-        return _part(read_document(_text(file), _shown(file)), file, _Values(options, given))
+
+def _graph(text: str, path: Path, given: _Given, sets: Sequence[str], profile: str) -> Graph:
+    def read_part(file: Path, values: Mapping[str, Any]) -> Part:
+        document = read_document(_text(file), _shown(file))
+        return _part(document, file, dataclasses.replace(given, values=values))
 
     document = read_document(text, _shown(path))
-    used |= params_used(document.data)
-    part = _part(document, path.resolve(), _Values(options, None))
+    part = _part(document, path.resolve(), given)
     if part.spec.inputs:
         message = "is a part of other graphs (it has inputs); use it with `use: graph`"
         raise GraphError([Problem(part.positions.of(("inputs",)), (), message)])
-    spec = apply_sets(expand(part, read_part), options.sets, part.positions)
+    spec = apply_sets(expand(part, read_part), sets, part.positions)
     return Graph(
         spec=spec,
-        profile=_profile(spec, options.profile),
-        profile_name=options.profile,
+        profile=_profile(spec, profile),
+        profile_name=profile,
         positions=part.positions,
-        params_used=frozenset(used),
+        params_used=frozenset(params_used(document.data)),
     )
 
 
@@ -135,23 +146,22 @@ class _Params(BaseModel):
 
 
 @dataclass(frozen=True, slots=True)
-class _Values:
-    """Where the values of parameters come from: the command line, or `with:` of a sub-graph."""
+class _Given:
+    """The values of parameters: text from the command line, and `with:` of a sub-graph."""
 
-    options: Options
-    given: Mapping[str, Any] | None
+    texts: Mapping[str, str]
+    values: Mapping[str, Any] | None = None  # of a sub-graph, which gets no texts but the built-in
+    needs_values: bool = True
 
-    def of(
-        self, specs: Mapping[str, ParamSpec], used: set[str], document: Document
-    ) -> dict[str, Any]:
+    def values_of(self, specs: Mapping[str, ParamSpec], document: Document) -> dict[str, Any]:
         """Return the values of all parameters.
 
         Raises:
             GraphError: If a value is missing or wrong, or belongs to no parameter.
         """
-        built_in = {name: spec for name, spec in BUILT_IN.items() if name in used}
-        known = built_in | dict(specs)
-        problems = self._unknown(known, document.positions)
+        used = params_used(document.data)
+        known = {name: s for name, s in BUILT_IN.items() if name in used} | dict(specs)
+        problems = self._unknown(known, document.positions.source)
         values = {}
         for name, spec in known.items():
             try:
@@ -163,35 +173,28 @@ class _Values:
             raise GraphError(problems)
         return values
 
-    def _unknown(self, known: Mapping[str, ParamSpec], positions: Positions) -> list[Problem]:
-        if self.given is not None:
-            place = Position(positions.source)
-            return [
-                Problem(place, ("params",), f"no parameter {name!r}{did_you_mean(name, known)}")
-                for name in self.given
-                if name not in known
-            ]
+    def _unknown(self, known: Mapping[str, ParamSpec], source: str) -> list[Problem]:
+        given = self.texts if self.values is None else self.values
         return [
             Problem(
-                Position(f"--param {name}={text}"),
+                Position(source if self.values is not None else f"--param {name}={value}"),
                 (),
-                f"{positions.source} has no parameter {name!r}{did_you_mean(name, known)}",
+                f"no parameter {name!r}{did_you_mean(name, known)}",
             )
-            for name, text in self.options.params.items()
+            for name, value in given.items()
             if name not in known
         ]
 
     def _value(self, name: str, spec: ParamSpec) -> Any:  # noqa: ANN401  # as spec says
-        options = self.options
-        if self.given is not None and name in self.given:
-            return typed_value(name, spec, self.given[name])
-        if name in options.params and (self.given is None or name in BUILT_IN):
-            return value_from_text(name, spec, options.params[name])
-        if spec.env is not None and spec.env in options.environ:
-            return value_from_text(name, spec, options.environ[spec.env])
+        if self.values is not None and name in self.values:
+            return typed_value(name, spec, self.values[name])
+        if name in self.texts and (self.values is None or name in BUILT_IN):
+            return value_from_text(name, spec, self.texts[name])
+        if spec.env is not None and spec.env in os.environ:
+            return value_from_text(name, spec, os.environ[spec.env])
         if spec.default is not None:
             return typed_value(name, spec, spec.default)
-        if not options.needs_values:
+        if not self.needs_values:
             return placeholder(name, spec)
         raise ValueError(f"no value{_how_to_give(name, spec)}")
 
@@ -204,7 +207,7 @@ def _how_to_give(name: str, spec: ParamSpec) -> str:
     return f"; give {how}{env}{about}"
 
 
-def _part(document: Document, path: Path, values: _Values) -> Part:
+def _part(document: Document, path: Path, given: _Given) -> Part:
     """Check one file and put its parameters in."""
     data, positions = document.data, document.positions
     if not isinstance(data, dict):
@@ -213,7 +216,7 @@ def _part(document: Document, path: Path, values: _Values) -> Part:
         params = _Params.model_validate(data).params
     except ValidationError as error:
         raise GraphError(problems_of(error, GraphSpec, (), positions)) from None
-    filled, problems = fill_in(document, values.of(params, params_used(data), document))
+    filled, problems = fill_in(document, given.values_of(params, document))
     if problems:
         raise GraphError(problems)
     try:
