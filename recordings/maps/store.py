@@ -23,7 +23,8 @@ from mapstream.streams.errors import MapError, MapFormatError
 IDENTIFIER = "mapstream map"
 VERSION = 1
 MANIFEST = "manifest.json"
-_TABLES = "tables"
+TABLES_FOLDER = "tables"
+CLOUDS = "clouds"  # where clouds of keyframes lie, see the resources
 _FILE = re.compile(r"tables/[a-z]+-[0-9a-f]{16}\.arrow")
 _MAX_MANIFEST_BYTES = 1_000_000
 _MAX_MAP_BYTES = 2**36
@@ -66,7 +67,7 @@ def save_locked(map_: Map, lock: FolderLock) -> None:
     folder = lock.folder
     before = _files_in_use(folder)
     try:
-        (folder / _TABLES).mkdir(exist_ok=True)
+        (folder / TABLES_FOLDER).mkdir(exist_ok=True)
         entries = {name: _save_table(folder, name, t) for name, t in map_.tables().items()}
         manifest = json.dumps(Manifest(tables=entries).model_dump(), indent=1) + "\n"
         write_whole(folder / MANIFEST, manifest.encode())
@@ -81,7 +82,7 @@ def save_locked(map_: Map, lock: FolderLock) -> None:
 def _save_table(folder: Path, name: str, table: Table) -> TableEntry:
     data = write_table(table)
     sha256 = hashlib.sha256(data).hexdigest()
-    file = f"{_TABLES}/{name}-{sha256[:16]}.arrow"
+    file = f"{TABLES_FOLDER}/{name}-{sha256[:16]}.arrow"
     path = folder / file
     if not (path.exists() and path.read_bytes() == data):  # a damaged file is written again
         write_whole(path, data)
@@ -93,12 +94,12 @@ def _files_in_use(folder: Path) -> list[str]:
     try:
         return [entry.file for entry in read_manifest(folder).tables.values()]
     except MapFormatError:
-        return [f"{_TABLES}/{path.name}" for path in (folder / _TABLES).glob("*.arrow")]
+        return [f"{TABLES_FOLDER}/{path.name}" for path in (folder / TABLES_FOLDER).glob("*.arrow")]
 
 
 def _remove_all_but(folder: Path, files: Iterable[str]) -> None:
     keep = {folder / file for file in files}
-    for path in (folder / _TABLES).iterdir():
+    for path in (folder / TABLES_FOLDER).iterdir():
         is_ours = path.name.endswith((".arrow", TEMPORARY))
         if is_ours and path not in keep:
             path.unlink(missing_ok=True)

@@ -63,7 +63,7 @@ def test_a_cloud_larger_than_the_bound_is_read_from_disk(tmp_path: Path) -> None
         assert_equal(store.get("large"), cloud(1000))
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 @given(st.integers(0, 50), st.booleans(), st.integers(-(2**63), 2**63 - 1))
 def test_a_cloud_survives_its_file(num_points: int, with_intensity: bool, stamp_ns: int) -> None:  # noqa: FBT001
     made = cloud(num_points, 1, with_intensity=with_intensity)

@@ -34,7 +34,7 @@ def appended(parts: list[Submap]) -> Map:
     return map_
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(st.sets(st.integers(1, 11)))
 def test_a_map_of_submaps_equals_the_uncut_map(cuts: set[int]) -> None:
     uncut = appended(submaps([12]))
@@ -133,7 +133,7 @@ def test_merging_a_mission_with_itself_is_refused() -> None:
         merge_maps([line_map(3), line_map(4)])
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(st.lists(st.booleans(), min_size=6, max_size=6))
 def test_selecting_vertices_leaves_no_dangling_reference(kept: list[bool]) -> None:
     map_ = full_map()

@@ -130,7 +130,7 @@ def test_M15_every_rule_has_a_corruption() -> None:
     assert len(CORRUPTIONS) >= 20
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 @given(st.integers(0, 2**32 - 1), st.sets(st.integers(1, 7)))
 def test_a_map_that_tools_made_is_clean(seed: int, cuts: set[int]) -> None:
     map_ = Map.empty()

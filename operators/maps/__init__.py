@@ -1,0 +1,1 @@
+"""What can be done to a map: plain functions from maps to maps, reports and files."""
