@@ -1,0 +1,82 @@
+"""ROS point clouds as `LidarScan`: sensor_msgs/PointCloud2 and the CustomMsg of Livox drivers."""
+
+from __future__ import annotations
+
+from collections import Counter
+
+import numpy as np
+import numpy.typing as npt
+
+from mapstream.recordings.decoding.cursor import CdrCursor
+from mapstream.recordings.decoding.point_fields import (
+    CloudLayout,
+    CloudSize,
+    PointField,
+    layout_of,
+    points_view,
+    scan_of,
+)
+from mapstream.streams.messages.sensors import LidarScan
+
+_DTYPES = {1: "i1", 2: "u1", 3: "<i2", 4: "<u2", 5: "<i4", 6: "<u4", 7: "<f4", 8: "<f8"}
+_LIVOX = layout_of(
+    (
+        PointField("offset_time", "<u4", 0),
+        PointField("x", "<f4", 4),
+        PointField("y", "<f4", 8),
+        PointField("z", "<f4", 12),
+        PointField("reflectivity", "u1", 16),
+        PointField("tag", "u1", 17),
+        PointField("line", "u1", 18),
+    ),
+    19,
+)
+
+
+def point_cloud_view(cursor: CdrCursor) -> tuple[npt.NDArray[np.void], CloudLayout, int, str]:
+    """Return the points of a sensor_msgs/PointCloud2 as a structured view, layout, stamp and frame."""
+    stamp_ns, frame = cursor.header()
+    height, width = cursor.u32(), cursor.u32()
+    fields = tuple(field for _ in range(cursor.u32()) if (field := _field(cursor)) is not None)
+    is_big_endian, point_bytes, row_bytes = cursor.u8(), cursor.u32(), cursor.u32()
+    data = cursor.raw(cursor.u32())
+    cursor.u8()  # is_dense: drivers that set it still send points that are not finite
+    cursor.end()
+    if is_big_endian:
+        raise ValueError("big-endian points")
+    layout = layout_of(fields, point_bytes)
+    return points_view(data, layout, CloudSize(height, width, row_bytes)), layout, stamp_ns, frame
+
+
+def _field(cursor: CdrCursor) -> PointField | None:
+    name, offset, kind, count = cursor.text(), cursor.u32(), cursor.u8(), cursor.u32()
+    if kind not in _DTYPES:
+        raise ValueError(f"point field {name} has the unknown type {kind}")
+    return PointField(name, _DTYPES[kind], offset) if count else None  # padding has none
+
+
+def point_cloud(cursor: CdrCursor, notices: Counter[str]) -> LidarScan:
+    """Read a sensor_msgs/PointCloud2."""
+    points, layout, stamp_ns, frame = point_cloud_view(cursor)
+    return scan_of(points, layout, stamp_ns=stamp_ns, frame=frame, notices=notices)
+
+
+def livox(cursor: CdrCursor, notices: Counter[str]) -> LidarScan:
+    """Read a livox_ros_driver(2)/CustomMsg."""
+    stamp_ns, frame = cursor.header()
+    cursor.array("<u8", 1)  # the same time by the sensor's own clock
+    cursor.array("<u4", 1)  # number of points, which the sequence repeats
+    cursor.array("<u1", 4)  # LiDAR id, reserved
+    count = cursor.u32()
+    points = _livox_points(cursor, count)
+    cursor.end()
+    return scan_of(points, _LIVOX, stamp_ns=stamp_ns, frame=frame, notices=notices)
+
+
+def _livox_points(cursor: CdrCursor, count: int) -> npt.NDArray[np.void]:
+    """Points are 19 bytes; CDR aligns each to 4, and the last has no padding behind it."""
+    stride = cursor.stride(_LIVOX.dtype.itemsize, 4)
+    if count == 0:
+        return np.empty(0, _LIVOX.dtype)
+    data = cursor.raw((count - 1) * stride + _LIVOX.dtype.itemsize)
+    return np.ndarray((count,), _LIVOX.dtype, data, strides=(stride,))
