@@ -1,0 +1,99 @@
+"""Motion as sensors and odometry tell it."""
+
+from __future__ import annotations
+
+import numpy as np
+import rerun as rr
+
+from mapstream.graph.views.colors import AXES, DRIVEN, ROBOT
+from mapstream.graph.views.scene import (
+    BASE,
+    ODOM,
+    Columns,
+    Drawing,
+    Entry,
+    Scene,
+    placed,
+    within,
+)
+from mapstream.streams.geometry import SE3
+from mapstream.streams.messages.estimates import Odometry
+from mapstream.streams.messages.sensors import (
+    FloatArray,
+    GnssFix,
+    ImuBatch,
+    IntArray,
+    TransformBatch,
+    WheelOdometry,
+)
+
+
+def view_imu_batch(imu: ImuBatch, scene: Scene) -> Drawing:
+    """Plot angular rate and specific force."""
+    drawing: list[Entry | Columns] = []
+    if scene.once("styles"):
+        lines = rr.SeriesLines(names=["x", "y", "z"], colors=AXES)
+        drawing += [Entry.of(name, lines, is_static=True) for name in ("gyro", "accel")]
+    drawing.append(_plot("gyro", imu.stamps_ns, imu.gyro_radps))
+    drawing.append(_plot("accel", imu.stamps_ns, imu.accel_mps2))
+    return drawing
+
+
+def view_odometry(odometry: Odometry, scene: Scene) -> Drawing:
+    """Move the robot and draw where it drove, before any correction."""
+    drawing = _motion(odometry.stamp_ns, odometry.T_odom_base, scene)
+    if odometry.velocity_mps is not None:
+        drawing.append(Entry.of("speed", rr.Scalars(float(np.linalg.norm(odometry.velocity_mps)))))
+    if odometry.is_lost:
+        text = "this step could not be measured: the pose is a prediction"
+        drawing.append(Entry.of("log", rr.TextLog(text, level=rr.TextLogLevel.WARN)))
+    return drawing
+
+
+def view_wheel_odometry(odometry: WheelOdometry, scene: Scene) -> Drawing:
+    """As odometry: it moves the robot where nothing better does."""
+    return _motion(odometry.stamp_ns, odometry.T_odom_base, scene)
+
+
+def view_gnss_fix(fix: GnssFix, scene: Scene) -> Drawing:  # noqa: ARG001  # a view
+    """Draw the fix on the earth."""
+    place = rr.GeoPoints(
+        lat_lon=[fix.latitude_deg, fix.longitude_deg],
+        radii=rr.Radius.ui_points(4.0),
+        colors=0x56B4E9FF,
+    )
+    return [Entry.of("", place), Entry.of("altitude", rr.Scalars(fix.altitude_m))]
+
+
+def view_transforms(batch: TransformBatch, scene: Scene) -> Drawing:  # noqa: ARG001  # a view
+    """Draw the transform tree as it was published; its frames do not meet ours."""
+    newest = {child: row for row, child in enumerate(batch.children)}
+    for child, row in newest.items():
+        T = SE3(batch.T_parent_child[row])
+        transform = rr.Transform3D(
+            translation=T.t,
+            quaternion=rr.Quaternion(xyzw=T.quat_xyzw),
+            parent_frame=f"tf:{batch.parents[row]}",
+            child_frame=f"tf:{child}",
+        )
+        yield Entry.of(child, transform, is_static=batch.is_static)
+
+
+def _motion(stamp_ns: int, T_odom_base: SE3, scene: Scene) -> list[Entry | Columns]:
+    drawing: list[Entry | Columns] = []
+    if scene.is_main():
+        scene.driven[stamp_ns] = T_odom_base.t
+        drawing.append(placed(BASE, ODOM, T_odom_base))
+        if scene.once("robot"):
+            body = rr.Boxes3D(half_sizes=[0.5, 0.3, 0.2], colors=ROBOT, fill_mode="solid")
+            frame = rr.CoordinateFrame(BASE)
+            drawing.append(Entry.of("robot", frame, body, rr.TransformAxes3D(2.0), is_static=True))
+    path, points = scene.trail("trail", T_odom_base.t)
+    line = rr.LineStrips3D([points], colors=DRIVEN, radii=rr.Radius.ui_points(1.5))
+    return [*drawing, within(path, ODOM, line)]
+
+
+def _plot(path: str, stamps_ns: IntArray, values: FloatArray) -> Columns:
+    """Return a plot of rows (N, 3)."""
+    columns = rr.Scalars.columns(scalars=values.reshape(-1)).partition([3] * len(values))
+    return Columns(path, stamps_ns, columns)

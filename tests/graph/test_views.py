@@ -1,0 +1,256 @@
+"""Each type of message is drawn without an error, and its drawing can be read back."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from importlib.metadata import EntryPoint
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import rerun as rr
+
+from mapstream.graph import views
+from mapstream.graph.tap_sinks import SinkSpec
+from mapstream.graph.views import Entry, Scene, ViewSettings, view_of
+from mapstream.graph.views.colors import ACCEPTED, REFUSED, switch_colors
+from mapstream.graph.views.lidar import thinned
+from mapstream.streams.geometry import SE3
+from mapstream.streams.messages.sensors import LidarScan
+from tests.graph import made_messages as made
+from tests.graph.rrd import columns_of, read_rrd, strict, values_of
+
+
+def drawn(path: Path, messages: Iterable[Any], scene: Scene | None = None) -> dict[str, list[Any]]:
+    """Draw messages of the output `op/port` into a file, and read it back."""
+    scene = scene or Scene()
+    scene.path = "op/port"
+    file = path / "drawn.rrd"
+    sink = SinkSpec.parse(f"save={file}").open()
+    with strict():
+        assert sink.try_open(None)
+        for sequence, message in enumerate(messages):
+            drawing = view_of(message)(message, scene)
+            sink.draw("op/port", drawing, stamp_ns=message.stamp_ns, sequence=sequence)
+        assert sink.flush(10.0)
+        sink.close()
+    return read_rrd(file)
+
+
+SENSORS = {
+    "scans": {
+        "/op/port": "Points3D:positions",
+        "/frames/sensor\\:lidar": "Transform3D:translation",
+    },
+    "imu": {"/op/port/gyro": "Scalars:scalars", "/op/port/accel": "Scalars:scalars"},
+    "laser": {"/op/port": "Points3D:positions"},
+    "gnss": {"/op/port": "GeoPoints:positions"},
+    "wheels": {"/frames/base": "Transform3D:quaternion"},
+    "tf": {"/op/port/os_lidar": "Transform3D:parent_frame"},
+    "features": {"/op/port": "Points2D:positions"},
+}
+
+
+@pytest.mark.parametrize("name", SENSORS)
+def test_P1_every_sensor_message_is_drawn(name: str, tmp_path: Path) -> None:
+    entities = drawn(tmp_path, [made.sensor_messages()[name]])
+
+    for entity, column in SENSORS[name].items():
+        assert column in columns_of(entities[entity])
+        assert {"stamp", "seq"} <= columns_of(entities[entity]) or entity.endswith("robot")
+
+
+@pytest.mark.parametrize(
+    ("encoding", "column"),
+    [
+        ("mono8", "Image:buffer"),
+        ("bgr8", "Image:buffer"),
+        ("rgb8", "Image:buffer"),
+        ("16UC1", "DepthImage:buffer"),
+        ("32FC1", "DepthImage:buffer"),
+    ],
+)
+def test_every_encoding_of_an_image_is_drawn(encoding: str, column: str, tmp_path: Path) -> None:
+    entities = drawn(tmp_path, [made.camera_frame(encoding)])
+
+    assert column in columns_of(entities["/op/port"])
+
+
+@pytest.mark.parametrize("encoding", ["mono8", "bgr8", "rgb8"])
+def test_large_images_are_compressed(encoding: str, tmp_path: Path) -> None:
+    scene = Scene(settings=ViewSettings(jpeg_above_bytes=100))
+
+    entities = drawn(tmp_path, [made.camera_frame(encoding)], scene)
+
+    assert values_of(entities["/op/port"], "EncodedImage:media_type") == [["image/jpeg"]]
+
+
+def test_images_of_known_formats_are_drawn_as_recorded(tmp_path: Path) -> None:
+    entities = drawn(tmp_path, [made.encoded_image("jpeg")])
+
+    (blob,) = values_of(entities["/op/port"], "EncodedImage:blob")
+    assert bytes(blob[0]) == made.encoded_image().data.tobytes()
+
+
+def test_an_image_of_an_unknown_format_is_described(tmp_path: Path) -> None:
+    entities = drawn(tmp_path, [made.encoded_image("h266")])
+
+    assert "h266" in values_of(entities["/op/port/summary"], "TextDocument:text")[0][0]
+
+
+def test_P1_odometry_moves_the_robot_and_leaves_a_trail(tmp_path: Path) -> None:
+    entities = drawn(tmp_path, [made.odometry(step) for step in range(5)])
+
+    places = values_of(entities["/frames/base"], "Transform3D:translation")
+    np.testing.assert_allclose(places[-1][0], made.pose(4).t, atol=1e-5)
+    assert values_of(entities["/frames/base"], "Transform3D:parent_frame")[0] == ["odom"]
+    trail = values_of(entities["/op/port/trail/0"], "LineStrips3D:strips")
+    assert len(trail[-1][0]) == 5
+
+
+def test_a_long_trail_is_drawn_in_stretches(tmp_path: Path) -> None:
+    """With a message only its last stretch is logged, so that a run's file grows with its length."""
+    entities = drawn(tmp_path, [made.odometry(step) for step in range(250)])
+
+    stretches = {name for name in entities if "/trail/" in name}
+    assert len(stretches) == 3
+
+
+def test_a_second_odometry_does_not_move_the_robot() -> None:
+    scene = Scene(path="other/odometry", main_odometry="op/odometry")
+
+    paths = [entry.path for entry in view_of(made.odometry(0))(made.odometry(0), scene)]
+
+    assert set(paths) == {"trail/0", "speed"}
+
+
+def test_P1_submaps_are_drawn_in_their_own_frame(tmp_path: Path) -> None:
+    entities = drawn(tmp_path, [made.submap(0), made.submap(1)])
+
+    path = f"/op/port/{made.MISSION[:8]}"
+    assert len(values_of(entities[f"{path}/0/cloud"], "Points3D:positions")[0]) == 4 * 50
+    assert len(values_of(entities[f"{path}/1/cloud"], "Points3D:positions")[0]) == 3 * 50
+    assert len(values_of(entities[f"{path}/0/edges"], "LineStrips3D:strips")[0]) == 3
+    (frame,) = values_of(entities[f"{path}/0/cloud"], "CoordinateFrame:frame")[0]
+    assert frame == f"submap:{made.MISSION[:8]}:0"
+
+
+def test_a_correction_moves_odometry_and_only_the_submaps_that_moved() -> None:
+    scene = Scene(path="op/port")
+    first = made.submap(0)
+    list(view_of(first)(first, scene))
+
+    same, shifted = made.correction(shift_m=0.0), made.correction(shift_m=2.0)
+    moved_by_none = [e.path for e in view_of(same)(same, scene)]
+    moved = [e.path for e in view_of(shifted)(shifted, scene)]
+
+    frame = f"/frames/submap\\:{made.MISSION[:8]}\\:0"
+    assert "/frames/odom" in moved_by_none
+    assert frame not in moved_by_none
+    assert frame in moved
+    np.testing.assert_allclose(scene.T_map_odom.t, [0, 2, 0])
+
+
+def test_P1_loops_are_drawn_by_verdict_and_said_why(tmp_path: Path) -> None:
+    messages = [*(made.odometry(step) for step in range(4)), made.loop_report()]
+
+    entities = drawn(tmp_path, messages)
+
+    assert len(values_of(entities["/op/port/accepted"], "LineStrips3D:strips")[-1]) == 1
+    assert len(values_of(entities["/op/port/refused"], "LineStrips3D:strips")[-1]) == 1
+    texts = [row[0] for row in values_of(entities["/op/port/log"], "TextLog:text")]
+    assert texts[0].startswith("accepted")
+    assert texts[1].startswith("too few inliers")
+
+
+def test_accepted_loops_follow_a_correction() -> None:
+    scene = Scene(path="op/port")
+    for message in (made.correction(), made.loop_report()):
+        list(view_of(message)(message, scene))
+
+    shifted = made.correction(shift_m=2.0)
+    entries = {e.path: e for e in view_of(shifted)(shifted, scene) if isinstance(e, Entry)}
+
+    strips = entries["/op/port/accepted"].archetypes[1].strips.as_arrow_array().to_pylist()
+    np.testing.assert_allclose(strips[0][0], made.pose(0).t + np.array([0, 2, 0]), atol=1e-5)
+
+
+def test_P1_a_map_is_drawn_with_its_loops_coloured_by_switch(tmp_path: Path) -> None:
+    entities = drawn(tmp_path, [made.made_map()])
+
+    mission = entities[f"/op/port/missions/{made.MISSION[:8]}"]
+    assert len(values_of(mission, "LineStrips3D:strips")[0][0]) == 4
+    assert values_of(entities["/op/port/edges/loop"], "LineStrips3D:colors") == [[ACCEPTED]]
+
+
+def test_P1_switch_values_go_from_red_to_green() -> None:
+    colors = switch_colors(np.array([0.0, 1.0, np.nan]))
+
+    assert colors.tolist() == [REFUSED, ACCEPTED, REFUSED]
+
+
+@dataclass(frozen=True)
+class Reading:
+    stamp_ns: int
+    temperature_c: float
+    name: str
+    samples: Any
+
+
+def test_a_message_of_an_unknown_type_is_plotted_and_described(tmp_path: Path) -> None:
+    reading = Reading(stamp_ns=1, temperature_c=21.5, name="motor", samples=np.zeros((3, 2)))
+
+    entities = drawn(tmp_path, [reading])
+
+    assert values_of(entities["/op/port/temperature_c"], "Scalars:scalars") == [[21.5]]
+    (text,) = values_of(entities["/op/port/summary"], "TextDocument:text")[0]
+    assert "float64 (3, 2)" in text
+    assert "'motor'" in text
+
+
+@dataclass(frozen=True)
+class Detections:
+    stamp_ns: int
+
+
+def view_detections(message: Detections, scene: Scene) -> list[Entry]:
+    return [Entry.of("boxes", rr.Boxes2D(sizes=[[1, 1]]))]
+
+
+def test_P2_a_plugin_draws_its_own_messages(monkeypatch: pytest.MonkeyPatch) -> None:
+    name = f"{Detections.__module__}.{Detections.__qualname__}"
+    point = EntryPoint(name, f"{__name__}:view_detections", views.GROUP)
+    monkeypatch.setattr(views, "entry_points", lambda **k: [point] if k["name"] == name else [])
+
+    entries = list(view_of(Detections(stamp_ns=0))(Detections(stamp_ns=0), Scene()))
+
+    assert [entry.path for entry in entries] == ["boxes"]
+
+
+def test_a_scan_without_points_is_drawn(tmp_path: Path) -> None:
+    empty = LidarScan(
+        stamp_ns=0, points=np.zeros((0, 3), np.float32), intensity=np.zeros(0, np.float32)
+    )
+
+    entities = drawn(tmp_path, [empty])
+
+    assert values_of(entities["/op/port"], "Points3D:positions") == [[]]
+
+
+@pytest.mark.parametrize("count", [0, 1, 99, 100, 101, 1000])
+def test_thinning_keeps_at_most_the_limit(count: int) -> None:
+    points, intensity = thinned(np.zeros((count, 3), np.float32), np.zeros(count, np.float32), 100)
+
+    assert len(points) <= 100
+    assert intensity is not None
+    assert len(intensity) == len(points) >= min(count, 50)
+
+
+def test_a_sensor_is_placed_again_only_when_it_moved() -> None:
+    scene = Scene()
+
+    drawings = [scene.mount("lidar", SE3.exp([0, 0, 0, x, 0, 0])) for x in (0.0, 0.0, 1.0)]
+
+    assert [len(drawing) for drawing in drawings] == [1, 0, 1]
