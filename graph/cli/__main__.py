@@ -1,0 +1,5 @@
+"""`python -m mapstream.graph.cli` is `mapstream`."""
+
+from mapstream.graph.cli import main
+
+main()

@@ -1,0 +1,106 @@
+"""`mapstream run`: a graph, on a recording or on live sensors."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from mapstream.graph.cli.output import (
+    JsonFlag,
+    ParamList,
+    ProfileName,
+    SetList,
+    given,
+    in_place,
+    say,
+    say_aside,
+    say_json,
+)
+from mapstream.graph.cli.planning import Request, plan_request
+from mapstream.graph.cli.run_report import print_report, report_as_json
+from mapstream.graph.cli.running import execute
+from mapstream.graph.plan import Plan
+
+RerunOption = Annotated[
+    str, typer.Option("--rerun", help="spawn, connect, connect=URL, save=FILE or off.")
+]
+
+
+def run(  # noqa: PLR0913  # one for each option of the command
+    graph: Annotated[str, typer.Argument(help="A graph file, or the name of a preset.")],
+    recording: Annotated[Path | None, typer.Argument(help="The recording to read.")] = None,
+    *,
+    map_: Annotated[Path | None, typer.Option("--map", help="The folder of the map.")] = None,
+    param: ParamList = None,
+    set_: SetList = None,
+    profile: ProfileName = "replay",
+    rate: Annotated[str | None, typer.Option(help="Times real time, such as 1.0; or max.")] = None,
+    start_s: Annotated[
+        float | None, typer.Option("--start", help="Seconds into the recording.")
+    ] = None,
+    end_s: Annotated[
+        float | None, typer.Option("--end", help="Seconds into the recording.")
+    ] = None,
+    rerun: RerunOption = "off",
+    json: JsonFlag = False,
+) -> None:
+    """Run a graph. Ctrl-C stops the sources, finishes what is under way and saves; again: quits."""
+    params = given(param, "--param")
+    if map_ is not None:
+        params["map"] = str(map_)
+    request = Request(
+        graph=graph, recording=recording, params=params, sets=set_ or (), profile=profile
+    )
+    section = {"start_s": start_s, "end_s": end_s}
+    request = replace(request, sets=[*_section_of(request, section), *request.sets])
+    planned = plan_request(request)
+    plan = planned.plan if rate is None else _at_rate(planned.plan, rate)
+    for warning in plan.warnings:
+        say_aside(f"warning: {warning}")
+    report, notes = execute(plan, rerun=rerun, has_progress=not json)
+    if json:
+        say_json(report_as_json(report) | {"viewer": notes, "written": written_by(plan)})
+    else:
+        print_report(report)
+        for note in notes:
+            say_aside(f"viewer: {note}")
+        for path in written_by(plan):
+            say(f"wrote {path}")
+    raise typer.Exit(report.exit_code)
+
+
+def _section_of(request: Request, section: dict[str, float | None]) -> list[str]:
+    """Return `--set` options that make the readers of the recording begin or end elsewhere."""
+    given_ones = {key: value for key, value in section.items() if value is not None}
+    if not given_ones:
+        return []
+    readers = [
+        name
+        for name, operator in request.load().spec.operators.items()
+        if request.recording is not None and operator.config.get("path") == str(request.recording)
+    ]
+    if not readers:
+        raise typer.BadParameter("--start and --end need a recording that the graph reads")
+    return [f"{name}.{key}={value}" for name in readers for key, value in given_ones.items()]
+
+
+def _at_rate(plan: Plan, rate: str) -> Plan:
+    """Return the plan with its clock at another rate."""
+    try:
+        value = "max" if rate == "max" else float(rate)
+    except ValueError:
+        raise typer.BadParameter(f"expected a number or max, found {rate!r}") from None
+    if value != "max" and not 0 < float(value) < float("inf"):
+        raise typer.BadParameter(f"expected more than 0, found {rate!r}")
+    clock = plan.profile.clock.model_copy(update={"rate": value})
+    return replace(plan, profile=plan.profile.model_copy(update={"clock": clock}))
+
+
+def written_by(plan: Plan) -> list[str]:
+    """Return the files and folders that the sinks of a plan write."""
+    configs = [node.config for node in plan.nodes.values() if not node.is_source]
+    paths = [getattr(config, "path", None) for config in configs]
+    return [in_place(Path(path)) for path in paths if path is not None and Path(path).exists()]
