@@ -16,7 +16,6 @@ import numpy as np
 from mapstream.recordings.g2o_text import (
     LIFTED,
     PLANAR_VARIANCE,
-    G2oEdge,
     G2oGraph,
     format_g2o,
     parse_g2o,
@@ -51,47 +50,50 @@ def read_g2o(path: Path | str) -> Map:
         T_mission_base=np.array([poses[number] for number in numbers.tolist()]),
     )
     map_ = replace(new_mission(Map.empty(), mission, name=path.name), vertices=vertices)
-    map_ = append_edges(map_, _relative_edges(graph, numbers))
-    fixed = np.searchsorted(numbers, np.array(graph.fixed, dtype=np.int64))
+    map_ = append_edges(map_, _relative_edges(graph, numbers, path))
+    fixed = np.searchsorted(numbers, graph.fixed)
     return append_edges(map_, _fixed_edges(fixed, vertices.T_mission_base[fixed]))
 
 
 def _placed(graph: G2oGraph, path: Path) -> dict[int, FloatArray]:
     """Return a pose for every vertex; those without one follow from edges between near numbers first."""
+    ends: list[tuple[int, int]] = [(a, b) for a, b in graph.ends.tolist()]
     neighbours: dict[int, list[int]] = defaultdict(list)
-    for index, edge in enumerate(graph.edges):
-        neighbours[edge.a].append(index)
-        neighbours[edge.b].append(index)
-    poses = dict(graph.poses) or {min(neighbours): np.eye(4)}
+    for index, (a, b) in enumerate(ends):
+        neighbours[a].append(index)
+        neighbours[b].append(index)
+    given = zip(graph.numbers.tolist(), graph.poses, strict=True)
+    poses: dict[int, FloatArray] = dict(given) or {min(neighbours): np.eye(4)}
     found = list(poses)
     leads: list[tuple[int, int]] = []  # edges from a known vertex, by the distance of their numbers
     while found or leads:
         for vertex in found:
             for index in neighbours[vertex]:
-                heapq.heappush(leads, (abs(graph.edges[index].a - graph.edges[index].b), index))
+                heapq.heappush(leads, (abs(ends[index][0] - ends[index][1]), index))
         found = []
         if leads:
-            edge = graph.edges[heapq.heappop(leads)[1]]
-            if edge.b not in poses:
-                poses[edge.b] = poses[edge.a] @ edge.T_a_b
-                found = [edge.b]
-            elif edge.a not in poses:
-                poses[edge.a] = poses[edge.b] @ invert(edge.T_a_b)
-                found = [edge.a]
-    if lost := sorted((neighbours.keys() | set(graph.fixed)) - poses.keys()):
+            _, index = heapq.heappop(leads)
+            a, b = ends[index]
+            if b not in poses:
+                poses[b] = poses[a] @ graph.T_a_b[index]
+                found = [b]
+            elif a not in poses:
+                poses[a] = poses[b] @ invert(graph.T_a_b[index])
+                found = [a]
+    if lost := sorted((neighbours.keys() | set(graph.fixed.tolist())) - poses.keys()):
         raise RecordingError(f"{path}: no line places vertex {lost[0]}, and no edge leads there")
     return poses
 
 
-def _relative_edges(graph: G2oGraph, numbers: IntArray) -> Edges:
-    a, b = (np.array([getattr(e, end) for e in graph.edges], dtype=np.int64) for end in "ab")
+def _relative_edges(graph: G2oGraph, numbers: IntArray, path: Path) -> Edges:
+    a, b = graph.ends.T
     return Edges(
         id=np.zeros((len(a), 16), dtype=np.uint8),
         kind=np.where(np.abs(b - a) == 1, "odometry", "loop").astype(object),
         vertex_a=np.searchsorted(numbers, a),
         vertex_b=np.searchsorted(numbers, b),
-        T_a_b=np.array([edge.T_a_b for edge in graph.edges]).reshape(-1, 4, 4),
-        covariance=_covariances(graph),
+        T_a_b=graph.T_a_b,
+        covariance=_covariances(graph, path),
         source=np.full(len(a), "g2o", dtype=object),
     )
 
@@ -108,15 +110,17 @@ def _fixed_edges(rows: IntArray, T_map_base: FloatArray) -> Edges:
     )
 
 
-def _covariances(graph: G2oGraph) -> FloatArray:
+def _covariances(graph: G2oGraph, path: Path) -> FloatArray:
     """Return the inverses of the information matrices; infinite where there is no information at all."""
-    information = np.array([edge.information for edge in graph.edges]).reshape(-1, 6, 6)
+    information = graph.information
     unmeasured = (information == 0).all(axis=2)[:, :, None] & np.eye(6, dtype=bool)
     filled = np.where(unmeasured, 1.0, information)
     refused = np.flatnonzero(np.linalg.eigvalsh(filled)[:, 0] <= 0)
     if len(refused):
-        where = graph.edges[refused[0]].where
-        raise RecordingError(f"{where}: the information matrix is not positive definite")
+        line = graph.edge_lines[refused[0]]
+        raise RecordingError(
+            f"{path}, line {line}: the information matrix is not positive definite"
+        )
     covariance = np.linalg.inv(filled)
     covariance = (covariance + np.swapaxes(covariance, 1, 2)) / 2
     return np.where(unmeasured, np.inf, covariance)
@@ -139,18 +143,14 @@ def write_g2o(map_: Map, path: Path | str) -> Counter[str]:
     number[rows] = np.arange(len(rows))
     is_fixed, is_written = edges.kind == "fixed", _is_written(edges)
     chosen = np.flatnonzero(is_written)
-    columns = (
-        number[edges.vertex_a[chosen]].tolist(),
-        number[edges.vertex_b[chosen]].tolist(),
-        edges.T_a_b[chosen],
-        _informations(edges.covariance[chosen]),
-    )
     graph = G2oGraph(
-        poses=dict(enumerate(map_.T_map_base(rows))),
-        edges=[
-            G2oEdge(a, b, T, information) for a, b, T, information in zip(*columns, strict=True)
-        ],
-        fixed=number[edges.vertex_a[is_fixed]].tolist(),
+        numbers=np.arange(len(rows)),
+        poses=map_.T_map_base(rows),
+        ends=number[np.column_stack([edges.vertex_a[chosen], edges.vertex_b[chosen]])],
+        T_a_b=edges.T_a_b[chosen],
+        information=_informations(edges.covariance[chosen]),
+        fixed=number[edges.vertex_a[is_fixed]],
+        edge_lines=chosen,
     )
     try:
         write_whole(Path(path), "".join(format_g2o(graph, is_planar=_is_planar(graph))).encode())
@@ -175,9 +175,7 @@ def _informations(covariance: FloatArray) -> FloatArray:
 
 
 def _is_planar(graph: G2oGraph) -> bool:
-    poses = np.array([*graph.poses.values(), *(edge.T_a_b for edge in graph.edges)])
-    poses = poses.reshape(-1, 4, 4)
-    information = np.array([edge.information for edge in graph.edges]).reshape(-1, 6, 6)
-    lifted = information[:, LIFTED] * PLANAR_VARIANCE
-    is_flat = np.allclose(poses[:, 2], [0, 0, 1, 0], rtol=0, atol=1e-12)
+    third_rows = np.concatenate([graph.poses, graph.T_a_b])[:, 2]
+    lifted = graph.information[:, LIFTED] * PLANAR_VARIANCE
+    is_flat = np.allclose(third_rows, [0, 0, 1, 0], rtol=0, atol=1e-12)
     return is_flat and np.allclose(lifted, np.eye(6)[LIFTED], rtol=0, atol=1e-9)

@@ -9,41 +9,44 @@ Source: Kuemmerle et al., g2o: a general framework for graph optimization, ICRA 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
+from mapstream.recordings.maps.tables import BoolArray
 from mapstream.streams.errors import RecordingError
 from mapstream.streams.geometry import quat_xyzw_from_rotation, rotation_from_quat_xyzw
-from mapstream.streams.messages.sensors import FloatArray
+from mapstream.streams.messages.sensors import FloatArray, IntArray
 
 PLANAR_VARIANCE = 1e-4  # of z [m^2], roll and pitch [rad^2] in edges of planar graphs
 LIFTED = [0, 1, 5]  # roll, pitch, z in our order
-_PLANAR = [3, 4, 2]  # x, y, yaw in our order
+PLANAR = [3, 4, 2]  # x, y, yaw in our order
 _SWAP = [3, 4, 5, 0, 1, 2]  # translation first <-> rotation first
 _NUM_VALUES = {"VERTEX_SE2": 4, "VERTEX_SE3:QUAT": 8, "EDGE_SE2": 11, "EDGE_SE3:QUAT": 30}
 
 
-@dataclass(frozen=True, slots=True)
-class G2oEdge:
-    """A measured transform between two numbered vertices."""
-
-    a: int
-    b: int
-    T_a_b: FloatArray  # (4, 4)
-    information: FloatArray  # (6, 6) rotation first
-    where: str = ""  # file and line, for messages
-
-
-@dataclass(slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class G2oGraph:
-    """What a file says."""
+    """What a file says, in its order."""
 
-    poses: dict[int, FloatArray] = field(default_factory=dict)  # number -> (4, 4)
-    edges: list[G2oEdge] = field(default_factory=list)
-    fixed: list[int] = field(default_factory=list)  # numbers of vertices that do not move
+    numbers: IntArray  # (N,) of the vertices that have a pose
+    poses: FloatArray  # (N, 4, 4)
+    ends: IntArray  # (M, 2) numbers of the vertices a and b of an edge
+    T_a_b: FloatArray  # (M, 4, 4)
+    information: FloatArray  # (M, 6, 6) rotation first
+    fixed: IntArray  # (F,) numbers of vertices that do not move
+    edge_lines: IntArray  # (M,) for messages
+
+
+@dataclass(frozen=True, slots=True)
+class _Line:
+    number: int
+    tag: str
+    ids: list[int]
+    values: list[float]
 
 
 def parse_g2o(path: Path) -> G2oGraph:
@@ -52,98 +55,108 @@ def parse_g2o(path: Path) -> G2oGraph:
     Raises:
         RecordingError: If a line is not understood; the message has the file and the line.
     """
-    graph = G2oGraph()
     try:
-        with path.open(encoding="ascii", errors="replace") as lines:
-            for number, line in enumerate(lines, start=1):
-                words = line.split("#")[0].split()
-                if words:
-                    _parse_line(graph, words[0], words[1:], f"{path}, line {number}")
+        text = path.read_text(encoding="ascii", errors="replace")
     except OSError as error:
         raise RecordingError(f"{path}: cannot be read: {error.strerror}") from error
-    if not graph.poses and not graph.edges:
+    lines = []
+    for number, line in enumerate(text.splitlines(), start=1):
+        words = line.split("#")[0].split()
+        if words:
+            lines.append(_parsed(words[0], words[1:], number, path))
+    vertices = [line for line in lines if line.tag.startswith("VERTEX")]
+    edges = [line for line in lines if line.tag.startswith("EDGE")]
+    if not vertices and not edges:
         raise RecordingError(f"{path}: no vertices and no edges; is it a g2o file?")
-    return graph
+    return G2oGraph(
+        numbers=np.array([line.ids[0] for line in vertices], dtype=np.int64),
+        poses=_poses(vertices),
+        ends=np.array([line.ids for line in edges], dtype=np.int64).reshape(-1, 2),
+        T_a_b=_poses(edges),
+        information=_informations(edges),
+        fixed=np.array(
+            [i for line in lines if line.tag == "FIX" for i in line.ids], dtype=np.int64
+        ),
+        edge_lines=np.array([line.number for line in edges], dtype=np.int64),
+    )
 
 
-def _parse_line(graph: G2oGraph, tag: str, values: list[str], where: str) -> None:
-    num_values = _NUM_VALUES.get(tag, len(values))
+def _parsed(tag: str, words: list[str], number: int, path: Path) -> _Line:
+    where = f"{path}, line {number}"
+    num_words = _NUM_VALUES.get(tag, len(words))
     if tag not in _NUM_VALUES and tag != "FIX":
         known = ", ".join([*_NUM_VALUES, "FIX"])
         raise RecordingError(f"{where}: {tag!r} is not known here; known are {known}")
-    if len(values) != num_values:
-        raise RecordingError(
-            f"{where}: expected {num_values} values after {tag}, got {len(values)}"
-        )
-    num_ids = {"F": len(values), "V": 1, "E": 2}[tag[0]]
+    if len(words) != num_words:
+        raise RecordingError(f"{where}: expected {num_words} values after {tag}, got {len(words)}")
+    num_ids = {"F": len(words), "V": 1, "E": 2}[tag[0]]
     try:
-        ids = [int(value) for value in values[:num_ids]]
-        numbers = _finite(values[num_ids:])
-        if tag == "FIX":
-            graph.fixed += ids
-        elif tag.startswith("VERTEX"):
-            graph.poses[ids[0]] = _pose(numbers)
-        else:
-            size = 3 if tag == "EDGE_SE2" else 7
-            T, information = _pose(numbers[:size]), _information(numbers[size:])
-            graph.edges.append(G2oEdge(ids[0], ids[1], T, information, where))
+        line = _Line(
+            number, tag, list(map(int, words[:num_ids])), list(map(float, words[num_ids:]))
+        )
     except ValueError as error:
         raise RecordingError(f"{where}: {error}") from error
+    if not all(map(math.isfinite, line.values)):
+        raise RecordingError(f"{where}: a value is not finite")
+    is_rotation = tag.endswith("QUAT")
+    if is_rotation and not any(line.values[3:7]):
+        raise RecordingError(f"{where}: quaternion without a direction")
+    return line
 
 
-def _finite(values: list[str]) -> FloatArray:
-    numbers = np.array(values, dtype=np.float64)
-    if not np.isfinite(numbers).all():
-        raise ValueError("a value is not finite")
-    return numbers
+def _is_planar_line(lines: list[_Line]) -> BoolArray:
+    return np.array([line.tag.endswith("SE2") for line in lines], dtype=bool)
 
 
-def _pose(numbers: FloatArray) -> FloatArray:
-    T = np.eye(4)
-    if len(numbers) == 3:
-        x, y, yaw = numbers
-        T[:2, :2] = [[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]]
-        T[:2, 3] = x, y
-    else:
-        T[:3, :3] = rotation_from_quat_xyzw(numbers[3:])
-        T[:3, 3] = numbers[:3]
+def _poses(lines: list[_Line]) -> FloatArray:
+    """Return the transforms (N, 4, 4) at the beginning of the values."""
+    is_planar = _is_planar_line(lines)
+    T = np.tile(np.eye(4), (len(lines), 1, 1))
+    flat = np.array([line.values[:3] for line in lines if line.tag.endswith("SE2")]).reshape(-1, 3)
+    full = np.array([line.values[:7] for line in lines if line.tag.endswith("QUAT")]).reshape(-1, 7)
+    cos, sin = np.cos(flat[:, 2]), np.sin(flat[:, 2])
+    T[is_planar, :2, 0] = np.column_stack([cos, sin])
+    T[is_planar, :2, 1] = np.column_stack([-sin, cos])
+    T[is_planar, :2, 3] = flat[:, :2]
+    T[~is_planar, :3, :3] = rotation_from_quat_xyzw(full[:, 3:])
+    T[~is_planar, :3, 3] = full[:, :3]
     return T
 
 
-def _information(upper: FloatArray) -> FloatArray:
-    """Return the matrix (6, 6) in our order of an upper triangle of 3 or 6 rows."""
-    size = 3 if len(upper) == 6 else 6
-    given = np.zeros((size, size))
-    given[np.triu_indices(size)] = upper
-    given += np.triu(given, 1).T
-    if size == 6:
-        return given[np.ix_(_SWAP, _SWAP)]
-    information = np.zeros((6, 6))
-    information[LIFTED, LIFTED] = 1 / PLANAR_VARIANCE
-    information[np.ix_(_PLANAR, _PLANAR)] = given
+def _informations(lines: list[_Line]) -> FloatArray:
+    """Return the matrices (N, 6, 6) in our order of the upper triangles at the end of the values."""
+    information = np.zeros((len(lines), 6, 6))
+    for row, line in enumerate(lines):
+        is_planar = line.tag.endswith("SE2")
+        order = PLANAR if is_planar else _SWAP
+        i, j = np.triu_indices(len(order))
+        at = np.array(order)
+        information[row, at[i], at[j]] = information[row, at[j], at[i]] = line.values[-len(i) :]
+        if is_planar:
+            information[row, LIFTED, LIFTED] = 1 / PLANAR_VARIANCE
     return information
 
 
 def format_g2o(graph: G2oGraph, *, is_planar: bool) -> Iterator[str]:
     """Yield the lines of a file; numbers are written so that they read back exactly."""
     kind = "SE2" if is_planar else "SE3:QUAT"
-    order = _PLANAR if is_planar else _SWAP
-    upper = np.triu_indices(len(order))
-    for number, T in graph.poses.items():
-        yield f"VERTEX_{kind} {number} {_words(_pose_numbers(T, is_planar=is_planar))}\n"
-    for number in graph.fixed:
+    order = np.array(PLANAR if is_planar else _SWAP)
+    i, j = order[np.array(np.triu_indices(len(order)))]
+    poses, measured = (_numbers(T, is_planar=is_planar) for T in (graph.poses, graph.T_a_b))
+    for number, pose in zip(graph.numbers.tolist(), poses.tolist(), strict=True):
+        yield f"VERTEX_{kind} {number} {_words(pose)}\n"
+    for number in graph.fixed.tolist():
         yield f"FIX {number}\n"
-    for edge in graph.edges:
-        pose = _words(_pose_numbers(edge.T_a_b, is_planar=is_planar))
-        information = _words(edge.information[np.ix_(order, order)][upper])
-        yield f"EDGE_{kind} {edge.a} {edge.b} {pose} {information}\n"
+    values = np.hstack([measured, graph.information[:, i, j]])
+    for (a, b), row in zip(graph.ends.tolist(), values.tolist(), strict=True):
+        yield f"EDGE_{kind} {a} {b} {_words(row)}\n"
 
 
-def _pose_numbers(T: FloatArray, *, is_planar: bool) -> FloatArray:
+def _numbers(T: FloatArray, *, is_planar: bool) -> FloatArray:
     if is_planar:
-        return np.array([T[0, 3], T[1, 3], np.arctan2(T[1, 0], T[0, 0])])
-    return np.concatenate([T[:3, 3], quat_xyzw_from_rotation(T[:3, :3])])
+        return np.column_stack([T[:, 0, 3], T[:, 1, 3], np.arctan2(T[:, 1, 0], T[:, 0, 0])])
+    return np.hstack([T[:, :3, 3], quat_xyzw_from_rotation(T[:, :3, :3])])
 
 
-def _words(numbers: FloatArray) -> str:
-    return " ".join(repr(number) for number in numbers.tolist())
+def _words(numbers: list[float]) -> str:
+    return " ".join(map(repr, numbers))
