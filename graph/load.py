@@ -39,7 +39,6 @@ class Graph:
     profile: ProfileSpec
     profile_name: str
     positions: Positions
-    params_used: frozenset[str]
 
 
 def preset_names() -> list[str]:
@@ -116,7 +115,6 @@ def _graph(text: str, path: Path, given: _Given, sets: Sequence[str], profile: s
         profile=_profile(spec, profile),
         profile_name=profile,
         positions=part.positions,
-        params_used=frozenset(params_used(document.data)),
     )
 
 
@@ -174,14 +172,13 @@ class _Given:
         return values
 
     def _unknown(self, known: Mapping[str, ParamSpec], source: str) -> list[Problem]:
-        given = self.texts if self.values is None else self.values
+        if self.values is not None:
+            given = dict.fromkeys(self.values, source)
+        else:
+            given = {name: _option(name, text) for name, text in self.texts.items()}
         return [
-            Problem(
-                Position(source if self.values is not None else f"--param {name}={value}"),
-                (),
-                f"no parameter {name!r}{did_you_mean(name, known)}",
-            )
-            for name, value in given.items()
+            Problem(Position(place), (), f"no parameter {name!r}{did_you_mean(name, known)}")
+            for name, place in given.items()
             if name not in known
         ]
 
@@ -197,6 +194,12 @@ class _Given:
         if not self.needs_values:
             return placeholder(name, spec)
         raise ValueError(f"no value{_how_to_give(name, spec)}")
+
+
+def _option(name: str, text: str) -> str:
+    """Return how the command line gave a parameter."""
+    ways = {"recording": f"RECORDING {text}", "map": f"--map {text}"}
+    return ways.get(name, f"--param {name}={text}")
 
 
 def _how_to_give(name: str, spec: ParamSpec) -> str:

@@ -75,7 +75,6 @@ def test_recording_and_map_need_no_declaration() -> None:
     graph = load(text, params={"recording": "b.mcap"})
 
     assert graph.spec.operators["sensors"].config["path"] == "b.mcap"
-    assert "recording" in graph.params_used
 
 
 def test_stand_ins_for_missing_values_let_one_look_at_a_preset_like_graph(tmp_path: Path) -> None:
@@ -145,6 +144,12 @@ def test_value_for_no_parameter() -> None:
     message = refusal(GRAPH, params={"recording": "x", "voxel": "1"})
 
     assert message == "--param voxel=1: no parameter 'voxel'; did you mean 'voxel_size_m'?"
+
+
+def test_recording_for_a_graph_that_reads_none() -> None:
+    text = GRAPH.replace("  recording: {type: path}\n", "").replace("$recording", "a.mcap")
+
+    assert refusal(text) == "RECORDING a.mcap: no parameter 'recording'; there is voxel_size_m"
 
 
 def test_file_that_is_no_map() -> None:
