@@ -9,6 +9,7 @@ Source: Sola et al., A micro Lie theory for state estimation in robotics, 2018, 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
 from typing import overload
 
 import numpy as np
@@ -165,6 +166,7 @@ class SE3:
         object.__setattr__(self, "matrix", matrix)
 
     @classmethod
+    @cache  # messages carry it by default, and checking a rotation costs 30 us
     def identity(cls) -> SE3:
         return cls(np.eye(4))
 
