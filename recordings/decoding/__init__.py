@@ -34,7 +34,7 @@ _Read = Callable[..., Any]  # of a cursor or a protobuf message; clouds also tak
 # the first one of a name is what a topic decodes to; others are for who asks for their type
 _ROS: list[tuple[str, type[Any], _Read]] = [
     ("sensor_msgs/Imu", ImuBatch, ros.imu),
-    ("sensor_msgs/PointCloud2", LidarScan, ros_clouds.point_cloud),
+    ("sensor_msgs/PointCloud2", LidarScan, ros_clouds.PointCloudReader),
     ("livox_ros_driver/CustomMsg", LidarScan, ros_clouds.livox),
     ("livox_ros_driver2/CustomMsg", LidarScan, ros_clouds.livox),
     ("sensor_msgs/Image", CameraFrame, ros_images.image),
@@ -113,7 +113,9 @@ def schema_key(channel: Channel) -> str:
 
 
 def _bound(channel: Channel, read: _Read, notices: Counter[str]) -> _Read:
-    if read in (ros_clouds.point_cloud, ros_clouds.livox, foxglove.point_cloud):
+    if read is ros_clouds.PointCloudReader:
+        return ros_clouds.PointCloudReader(notices)
+    if read in (ros_clouds.livox, foxglove.point_cloud):
         return partial(read, notices=notices)
     if read is ros.transforms:
         return partial(read, is_static=channel.topic.endswith("tf_static"))

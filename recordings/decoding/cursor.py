@@ -61,8 +61,10 @@ class CdrCursor:
     def u16(self) -> int:
         return int(self._number(_U16))
 
-    def u32(self) -> int:
-        return int(self._number(_U32))
+    def u32(self) -> int:  # the commonest, and clouds have many
+        start = self._align(4)
+        self.position = start + 4
+        return int(_U32.unpack_from(self.data, start)[0])
 
     def f32(self) -> float:
         return float(self._number(_F32))

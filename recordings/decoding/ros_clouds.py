@@ -33,19 +33,47 @@ _LIVOX = layout_of(
 )
 
 
-def point_cloud_view(cursor: CdrCursor) -> tuple[npt.NDArray[np.void], CloudLayout, int, str]:
-    """Return the points of a sensor_msgs/PointCloud2 as a structured view, layout, stamp and frame."""
-    stamp_ns, frame = cursor.header()
-    height, width = cursor.u32(), cursor.u32()
-    fields = tuple(field for _ in range(cursor.u32()) if (field := _field(cursor)) is not None)
-    is_big_endian, point_bytes, row_bytes = cursor.u8(), cursor.u32(), cursor.u32()
-    data = cursor.raw(cursor.u32())
-    cursor.u8()  # is_dense: drivers that set it still send points that are not finite
-    cursor.end()
-    if is_big_endian:
-        raise ValueError("big-endian points")
-    layout = layout_of(fields, point_bytes)
-    return points_view(data, layout, CloudSize(height, width, row_bytes)), layout, stamp_ns, frame
+class PointCloudReader:
+    """Reads the sensor_msgs/PointCloud2 of one topic; a field table that repeats is parsed once."""
+
+    def __init__(self, notices: Counter[str]) -> None:
+        self._notices = notices
+        self._layout: CloudLayout | None = None
+        self._table_start, self._table = (
+            0,
+            b"",
+        )  # where the layout was in its message, and its bytes
+
+    def __call__(self, cursor: CdrCursor) -> LidarScan:
+        points, layout, stamp_ns, frame = self.view(cursor)
+        return scan_of(points, layout, stamp_ns=stamp_ns, frame=frame, notices=self._notices)
+
+    def view(self, cursor: CdrCursor) -> tuple[npt.NDArray[np.void], CloudLayout, int, str]:
+        """Return the points as a structured view on the message, their layout, stamp and frame."""
+        stamp_ns, frame = cursor.header()
+        height, width = cursor.u32(), cursor.u32()
+        layout = self._read_layout(cursor)
+        row_bytes = cursor.u32()
+        data = cursor.raw(cursor.u32())
+        cursor.u8()  # is_dense: drivers that set it still send points that are not finite
+        cursor.end()
+        points = points_view(data, layout, CloudSize(height, width, row_bytes))
+        return points, layout, stamp_ns, frame
+
+    def _read_layout(self, cursor: CdrCursor) -> CloudLayout:
+        """Read from the number of fields to the size of a point."""
+        start, end = cursor.position, cursor.position + len(self._table)
+        is_known = start == self._table_start and cursor.data[start:end] == self._table
+        if self._layout is not None and is_known:
+            cursor.position = end
+            return self._layout
+        fields = [_field(cursor) for _ in range(cursor.u32())]
+        is_big_endian, point_bytes = cursor.u8(), cursor.u32()
+        if is_big_endian:
+            raise ValueError("big-endian points")
+        self._layout = layout_of(tuple(field for field in fields if field), point_bytes)
+        self._table_start, self._table = start, bytes(cursor.data[start : cursor.position])
+        return self._layout
 
 
 def _field(cursor: CdrCursor) -> PointField | None:
@@ -53,12 +81,6 @@ def _field(cursor: CdrCursor) -> PointField | None:
     if kind not in _DTYPES:
         raise ValueError(f"point field {name} has the unknown type {kind}")
     return PointField(name, _DTYPES[kind], offset) if count else None  # padding has none
-
-
-def point_cloud(cursor: CdrCursor, notices: Counter[str]) -> LidarScan:
-    """Read a sensor_msgs/PointCloud2."""
-    points, layout, stamp_ns, frame = point_cloud_view(cursor)
-    return scan_of(points, layout, stamp_ns=stamp_ns, frame=frame, notices=notices)
 
 
 def livox(cursor: CdrCursor, notices: Counter[str]) -> LidarScan:
