@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import cv2
 import numpy as np
 
@@ -37,17 +39,29 @@ _POINTS = _RNG.normal(size=(50, 3)).astype(np.float32)
 _IMAGE = np.arange(48 * 64, dtype=np.uint8).reshape(48, 64)
 
 
+@cache
 def pose(step: int) -> SE3:
     return SE3.exp([0.0, 0.0, 0.05 * step, 1.0 * step, 0.0, 0.0])
 
 
+@cache
 def odometry(step: int) -> Odometry:
     return Odometry(stamp_ns=step * STEP_NS, T_odom_base=pose(step), velocity_mps=np.ones(3))
 
 
+def scan(stamp_ns: int = 0, num_points: int = 50) -> LidarScan:
+    points = np.resize(_POINTS, (num_points, 3))
+    return LidarScan(stamp_ns=stamp_ns, points=points, intensity=points[:, 0])
+
+
+def cloud(stamp_ns: int = 0, num_points: int = 50) -> PointCloud:
+    return PointCloud(stamp_ns=stamp_ns, points=np.resize(_POINTS, (num_points, 3)))
+
+
+@cache
 def keyframe(step: int) -> Keyframe:
-    cloud = PointCloud(stamp_ns=step * STEP_NS, points=_POINTS)
-    return Keyframe(stamp_ns=step * STEP_NS, odometry=odometry(step), cloud=cloud)
+    stamp_ns = step * STEP_NS
+    return Keyframe(stamp_ns=stamp_ns, odometry=odometry(step), cloud=cloud(stamp_ns))
 
 
 def edge(a: int, b: int, kind: str = "odometry") -> RelativePose:
@@ -63,6 +77,7 @@ def edge(a: int, b: int, kind: str = "odometry") -> RelativePose:
     )
 
 
+@cache
 def submap(index: int = 0, length: int = 3) -> Submap:
     first = index * length
     steps = range(first, first + length + 1)
@@ -74,6 +89,7 @@ def submap(index: int = 0, length: int = 3) -> Submap:
     )
 
 
+@cache
 def correction(num_poses: int = 4, shift_m: float = 0.0) -> MapCorrection:
     poses = np.stack([pose(step).matrix for step in range(num_poses)])
     poses[:, 1, 3] += shift_m
@@ -102,6 +118,7 @@ def loop_report() -> LoopReport:
     return LoopReport(stamp_ns=3 * STEP_NS, edges=edges, candidates=(accepted, refused))
 
 
+@cache
 def made_map() -> Map:
     return add_edges(append_submap(Map.empty(), submap()), [edge(0, 3, kind="loop")])
 
@@ -111,18 +128,18 @@ def encoded_image(format: str = "jpeg") -> EncodedImage:  # noqa: A002  # as in 
     return EncodedImage(stamp_ns=0, data=np.frombuffer(data.tobytes(), np.uint8), format=format)
 
 
-def camera_frame(encoding: str = "mono8") -> CameraFrame:
+def camera_frame(encoding: str = "mono8", stamp_ns: int = 0) -> CameraFrame:
     dtype = {"16UC1": np.uint16, "32FC1": np.float32}.get(encoding, np.uint8)
     image = _IMAGE.astype(dtype)
     if encoding in ("bgr8", "rgb8"):
         image = np.stack([image] * 3, axis=-1)
-    return CameraFrame(stamp_ns=0, image=image, encoding=encoding)
+    return CameraFrame(stamp_ns=stamp_ns, image=image, encoding=encoding)
 
 
 def sensor_messages() -> dict[str, object]:
     stamps = np.arange(5) * STEP_NS
     return {
-        "scans": LidarScan(stamp_ns=0, points=_POINTS, intensity=_POINTS[:, 0]),
+        "scans": scan(),
         "imu": ImuBatch(stamps_ns=stamps, gyro_radps=np.ones((5, 3)), accel_mps2=np.ones((5, 3))),
         "laser": LaserScan2D(
             stamp_ns=0,

@@ -1,0 +1,135 @@
+"""The layout of the viewer, made from the plan: a newcomer sees the map grow, and why.
+
+On the left the map, and below it the operators. On the right what the cameras see, the plots of the run, and
+the log. What would hide the map (raw scans where deskewed ones exist, refused loops) is logged, and shown once it
+is ticked in the viewer.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import rerun.blueprint as rrb
+
+from mapstream.graph.plan import Plan
+from mapstream.graph.tap_outputs import Output
+from mapstream.graph.views.run import GRAPH
+from mapstream.graph.views.scene import MAP
+from mapstream.recordings.maps import Map
+from mapstream.streams.messages import estimates, sensors
+
+_IN_SPACE = (
+    sensors.LidarScan,
+    sensors.LaserScan2D,
+    sensors.WheelOdometry,
+    estimates.PointCloud,
+    estimates.Odometry,
+    estimates.Keyframe,
+    estimates.Submap,
+    estimates.LoopReport,
+    estimates.MapCorrection,
+    Map,
+)
+_PICTURES = (sensors.CameraFrame, sensors.EncodedImage)
+_KNOWN = (
+    *_IN_SPACE,
+    *_PICTURES,
+    sensors.ImuBatch,
+    sensors.GnssFix,
+    sensors.TransformBatch,
+    estimates.ImageFeatures,
+)
+_HIDDEN = rrb.EntityBehavior(visible=False)
+
+
+def blueprint_of(plan: Plan, outputs: Sequence[Output]) -> rrb.Blueprint:
+    """Return the layout for the outputs that are drawn."""
+    operators = rrb.GraphView(origin=GRAPH, name="Operators")
+    space = [output for output in outputs if output.sends(*_IN_SPACE)]
+    main = rrb.Vertical(map_view(space), operators, row_shares=[3, 1]) if space else operators
+    side = [_cameras(plan, outputs), _plots(outputs), _texts(outputs)]
+    shown = [rrb.Tabs(*views) if len(views) > 1 else views[0] for views in side if views]
+    return rrb.Blueprint(
+        rrb.Horizontal(main, rrb.Vertical(*shown), column_shares=[5, 2]),
+        rrb.TimePanel(timeline="stamp", state="collapsed"),
+        rrb.BlueprintPanel(state="collapsed"),
+        rrb.SelectionPanel(state="collapsed"),
+    )
+
+
+def map_view(outputs: Sequence[Output]) -> rrb.Spatial3DView:
+    """Return the view of all that has a place, seen from the map's frame."""
+    has_clouds = any(output.sends(estimates.PointCloud) for output in outputs)
+    has_maps = any(output.sends(Map) for output in outputs)
+    hidden = [o.path for o in outputs if o.sends(estimates.Keyframe)]
+    hidden += [o.path for o in outputs if has_clouds and o.sends(sensors.LidarScan)]
+    hidden += [f"{o.path}/refused" for o in outputs if o.sends(estimates.LoopReport)]
+    hidden += [
+        f"{o.path}/trajectory" for o in outputs if has_maps and o.sends(estimates.MapCorrection)
+    ]
+    return rrb.Spatial3DView(
+        name="Map",
+        origin="/",
+        contents=[f"+ /{output.path}/**" for output in outputs],
+        overrides={f"/{path}": _HIDDEN for path in hidden},
+        spatial_information=rrb.SpatialInformation(target_frame=MAP),
+        background=rrb.Background(color=0x0B0E14FF),
+        line_grid=rrb.LineGrid3D(visible=True, spacing=10.0, color=0xFFFFFF10),
+    )
+
+
+def _cameras(plan: Plan, outputs: Sequence[Output]) -> list[rrb.View]:
+    """Return a view per camera, with all features that were found in its pictures."""
+    features = [output for output in outputs if output.sends(estimates.ImageFeatures)]
+    views: list[rrb.View] = []
+    for picture in (output for output in outputs if output.sends(*_PICTURES)):
+        readers = _readers(plan, picture)
+        found = [f for f in features if f.edge.from_node in readers]
+        contents = [f"+ /{output.path}/**" for output in (picture, *found)]
+        views.append(rrb.Spatial2DView(name=picture.path, origin="/", contents=contents))
+    return views
+
+
+def _readers(plan: Plan, output: Output) -> set[str]:
+    """Return all operators that read an output, or what its readers make of it."""
+    source = output.edge.from_node, output.edge.from_port
+    readers = {e.to_node for e in plan.edges if (e.from_node, e.from_port) == source}
+    while True:
+        more = {e.to_node for e in plan.edges if e.from_node in readers}
+        if more <= readers:
+            return readers
+        readers |= more
+
+
+def _plots(outputs: Sequence[Output]) -> list[rrb.View]:
+    """Return the plots: load first, because it says which operator limits the run."""
+    plots: list[rrb.View] = [
+        rrb.TimeSeriesView(name=name, origin=f"/run/{entity}", plot_legend=rrb.Corner2D.LeftTop)
+        for name, entity in (
+            ("Load [%]", "load"),
+            ("Rates [1/s]", "rates"),
+            ("Queues", "queues"),
+            ("Calls [ms]", "call_ms"),
+            ("Losses", "losses"),
+        )
+    ]
+    plots += [
+        rrb.TimeSeriesView(name=f"{output.path} {name}", origin=f"/{output.path}/{entity}")
+        for output in outputs
+        if output.sends(sensors.ImuBatch)
+        for name, entity in (("[rad/s]", "gyro"), ("[m/s²]", "accel"))
+    ]
+    return plots
+
+
+def _texts(outputs: Sequence[Output]) -> list[rrb.View]:
+    """Return the log, what nobody wrote a view for, and the fixes on the earth."""
+    views: list[rrb.View] = [rrb.TextLogView(name="Log", origin="/")]
+    views += [
+        rrb.MapView(name=output.path, origin=f"/{output.path}")
+        for output in outputs
+        if output.sends(sensors.GnssFix)
+    ]
+    others = [output for output in outputs if not output.sends(*_KNOWN)]
+    views += [rrb.TextDocumentView(name=o.path, origin=f"/{o.path}/summary") for o in others]
+    return views
