@@ -24,14 +24,13 @@ def columns_of(batches: list[Any]) -> set[str]:
 
 
 def values_of(batches: list[Any], column: str) -> list[Any]:
-    """Return a column's rows, in the order in which they were logged."""
-    return [
-        row
-        for batch in batches
-        if column in batch.schema.names
-        for row in batch.column(column).to_pylist()
-        if row is not None
-    ]
+    """Return a column's rows, in the order in which they were drawn; chunks have an order of their own."""
+    rows = []
+    for batch in (batch for batch in batches if column in batch.schema.names):
+        is_timed = "seq" in batch.schema.names
+        order = batch.column("seq").to_pylist() if is_timed else [-1] * batch.num_rows
+        rows += list(zip(order, batch.column(column).to_pylist(), strict=True))
+    return [row for _, row in sorted(rows, key=lambda timed: timed[0]) if row is not None]
 
 
 @contextmanager
