@@ -154,7 +154,7 @@ class Edges(Table):
     meaning: ClassVar[str] = "A constraint between two vertices, or on one."
 
     id: IdArray = _column(
-        "uint8", "from kind, source, vertices and the first measured value", (16,)
+        "uint8", "from kind, source, vertices, and how many such edges come before", (16,)
     )
     kind: TextArray = _column(
         "text", "odometry, loop, imu, absolute, fixed ...; unknown kinds are kept as they are"
