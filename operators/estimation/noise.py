@@ -1,0 +1,64 @@
+"""Covariances as gtsam's noise models, exact where a direction was not measured."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gtsam
+import numpy as np
+
+from mapstream.streams.errors import EstimationError
+from mapstream.streams.messages.sensors import FloatArray
+
+
+def noise_from_covariance(covariance: FloatArray) -> Any:  # noqa: ANN401  # gtsam has no types
+    """Return the noise model of a covariance (6, 6), rotation first [rad, m].
+
+    A direction with an infinite variance was not measured: its information is exactly zero, never a huge
+    sigma. `gtsam.noiseModel.Gaussian.Information` is silently wrong for singular matrices, hence the root.
+
+    Raises:
+        EstimationError: If a finite part is not positive definite, or a NaN is in it.
+    """
+    is_measured = np.isfinite(np.diagonal(covariance))
+    measured = covariance[np.ix_(is_measured, is_measured)]
+    if np.isnan(covariance).any() or not np.isfinite(measured).all():
+        raise EstimationError(f"a covariance with undefined values: {covariance.tolist()}")
+    eigenvalues, vectors = np.linalg.eigh(measured)
+    if measured.size and eigenvalues[0] <= 0:
+        raise EstimationError(f"a covariance must be positive definite: {covariance.tolist()}")
+    if np.array_equal(measured, np.diag(np.diagonal(measured))):
+        precisions = np.zeros(len(covariance))
+        precisions[is_measured] = 1 / np.diagonal(measured)
+        return gtsam.noiseModel.Diagonal.Precisions(precisions)
+    root = np.zeros_like(covariance)
+    root[np.ix_(is_measured, is_measured)] = (vectors / np.sqrt(eigenvalues)).T
+    return gtsam.noiseModel.Gaussian.SqrtInformation(root, False)  # noqa: FBT003  # smart=False
+
+
+class NoiseModels:
+    """Noise models by covariance, each made once: most edges of a map share a few."""
+
+    def __init__(self) -> None:
+        self._made: dict[bytes, Any] = {}
+
+    def __call__(self, covariance: FloatArray) -> Any:  # noqa: ANN401
+        key = covariance.tobytes()
+        if key not in self._made:
+            self._made[key] = noise_from_covariance(covariance)
+        return self._made[key]
+
+
+def switchable(noise: Any, prior_weight: float) -> Any:  # noqa: ANN401
+    """Return the noise of a switchable constraint whose switch is eliminated.
+
+    With the prior weight Phi on a switch, the best switch is Phi / (Phi + chi2), and the cost that is left is
+    that of Geman-McClure with c = sqrt(Phi) (Suenderhauf and Protzel, IROS 2012; Agarwal et al., ICRA 2013).
+    """
+    loss = gtsam.noiseModel.mEstimator.GemanMcClure.Create(float(np.sqrt(prior_weight)))
+    return gtsam.noiseModel.Robust.Create(loss, noise)
+
+
+def switch_of(chi2: float, prior_weight: float) -> float:
+    """Return the switch (0 to 1) that belongs to a switchable constraint with this chi2."""
+    return prior_weight / (prior_weight + chi2)

@@ -1,0 +1,118 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from mapstream.operators.backend.live_map import LiveMap
+from mapstream.operators.backend.optimizer import Optimizer, OptimizerConfig
+from mapstream.operators.estimation.batch import OptimizeConfig, optimize_map
+from mapstream.operators.estimation.incremental import IncrementalProblem
+from mapstream.operators.testing import run_operator
+from mapstream.streams.geometry import SE3
+from mapstream.streams.messages.estimates import LoopReport
+from tests.operators.estimation import worlds
+
+NUM, LAP = 121, 60
+
+
+def run_live(seed: int, num_false: int = 0) -> tuple[LiveMap, list[SE3]]:
+    rng = np.random.default_rng(seed)
+    truth = worlds.circle(NUM)
+    loops = worlds.loops(truth, rng, lap=LAP)
+    wrong = np.random.default_rng(seed + 1000)  # of its own: the drive is the same without them
+    ends = wrong.permutation(LAP)
+    loops += [worlds.false_loop(int(a), int(a) + LAP, wrong) for a in ends[:num_false]]
+    live = LiveMap(OptimizeConfig())
+    for submap in worlds.submaps(truth, rng):
+        live.append(submap)
+        stamps = {keyframe.stamp_ns for keyframe in submap.keyframes[1:]}
+        live.close_loops([loop for loop in loops if loop.stamp_b_ns in stamps])
+    return live, truth
+
+
+def test_K2_incremental_equals_batch_after_convergence() -> None:
+    live, _ = run_live(1)
+
+    batch, _ = optimize_map(live.map, OptimizeConfig(is_robust=False))
+
+    np.testing.assert_allclose(
+        live.map.vertices.T_mission_base, batch.vertices.T_mission_base, atol=1e-4
+    )
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_false_loops_leave_the_live_problem(seed: int) -> None:
+    live, truth = run_live(seed, num_false=4)
+    clean, _ = run_live(seed)
+
+    assert live.num_contradictions > 0
+    assert worlds.rmse_m(live.map.vertices.T_mission_base, truth) < 1.2 * worlds.rmse_m(
+        clean.map.vertices.T_mission_base, truth
+    )
+
+
+def test_K2_a_removed_factor_leaves_the_problem_as_it_was() -> None:
+    rng = np.random.default_rng(3)
+    truth = worlds.circle(30, laps=1)
+    live = LiveMap(OptimizeConfig())
+    for submap in worlds.submaps(truth, rng):
+        live.append(submap)
+    before = live._problem.poses()
+    loop = worlds.false_loop(2, 25, rng)
+    live.close_loops(
+        [
+            loop.__class__(
+                **{**{f: getattr(loop, f) for f in loop.__slots__}, "is_switchable": False}
+            )
+        ]
+    )
+    moved = np.abs(live._problem.poses() - before).max()
+
+    live._problem.update(poses=np.zeros((0, 4, 4)), add={}, remove=[len(live.map.edges) - 1])
+    live._problem.settle()
+
+    assert moved > 0.1
+    np.testing.assert_allclose(live._problem.poses(), before, atol=1e-4)
+
+
+def test_a_long_open_chain_survives_what_isam2_does_not() -> None:
+    """A rebuild leaves the same poses: a chain without loops keeps its odometry."""
+    problem = IncrementalProblem()
+    truth = worlds.circle(50)
+    live = LiveMap(OptimizeConfig())
+    for submap in worlds.submaps(truth, np.random.default_rng(5)):
+        live.append(submap)
+    problem = live._problem
+    before = problem.poses()
+
+    problem._rebuild(problem._isam.calculateEstimate())
+
+    assert problem.num_rebuilds == 1
+    np.testing.assert_allclose(problem.poses(), before, atol=1e-6)
+
+
+@pytest.mark.anyio
+async def test_O1_every_submap_gives_a_correction_and_the_end_a_map() -> None:
+    rng = np.random.default_rng(1)
+    truth = worlds.circle(NUM)
+    drive = worlds.submaps(truth, rng)
+    loops = worlds.loops(truth, rng, lap=LAP)
+    reports = [
+        LoopReport(
+            stamp_ns=s.stamp_ns,
+            edges=tuple(e for e in loops if e.stamp_b_ns in {k.stamp_ns for k in s.keyframes[1:]}),
+        )
+        for s in drive
+    ]
+
+    sent = await run_operator(
+        Optimizer(OptimizerConfig(map_every_submaps=4)), submaps=drive, loops=reports
+    )
+
+    assert [c.stamp_ns for c in sent["corrections"]] == [s.stamp_ns for s in drive]
+    assert len(sent["maps"]) == len(drive) // 4 + 1
+    final = sent["maps"][-1]
+    assert worlds.rmse_m(final.vertices.T_mission_base, truth) < 0.2
+    last = sent["corrections"][-1]
+    newest = last.T_mission_odom @ drive[-1].keyframes[-1].odometry.T_odom_base
+    np.testing.assert_allclose(newest.matrix, last.T_mission_base[-1], atol=1e-9)
