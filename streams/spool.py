@@ -6,6 +6,7 @@ import pickle
 import tempfile
 from collections import deque
 from pathlib import Path
+from typing import IO
 
 from mapstream.streams.limits import Entry
 
@@ -13,8 +14,8 @@ from mapstream.streams.limits import Entry
 class DiskSpool:
     """Entries in a file without a name, first in, first out, bounded by bytes.
 
-    The file vanishes with the process, however that ends. Nobody else can write to it, so pickle is
-    safe. Its space is used again once it has been read to the end.
+    There is a file only while there are entries, and it vanishes with the process, however that ends.
+    Nobody else can write to it, so pickle is safe. Its space is free again once the last entry is read.
     """
 
     def __init__(self, max_bytes: int, directory: Path | None = None) -> None:
@@ -23,13 +24,11 @@ class DiskSpool:
         Args:
             max_bytes: How long the file may grow.
             directory: Where the file takes its space; by default where temporary files go.
-
-        Raises:
-            OSError: If no file can be made there.
         """
         self._max_bytes = max_bytes
-        self._file = tempfile.TemporaryFile(dir=directory)  # noqa: SIM115  # the spool's own lifetime
-        self._lengths: deque[int] = deque()
+        self._directory = directory
+        self._file: IO[bytes] | None = None
+        self._lengths: deque[tuple[int, ...]] = deque()  # of the parts of each entry
         self._read_at = 0
         self._write_at = 0
 
@@ -40,27 +39,36 @@ class DiskSpool:
         """Keep one entry; False if the file would grow too long.
 
         Raises:
-            OSError: If the disk is full.
+            OSError: If no file can be made, or the disk is full.
         """
-        record = pickle.dumps(entry, protocol=pickle.HIGHEST_PROTOCOL)
-        if self._write_at + len(record) > self._max_bytes and not even_if_full:
+        buffers: list[pickle.PickleBuffer] = []
+        head = pickle.dumps(entry, protocol=5, buffer_callback=buffers.append)
+        parts = [memoryview(head), *(buffer.raw() for buffer in buffers)]
+        length = sum(map(len, parts))
+        if self._write_at + length > self._max_bytes and not even_if_full:
             return False
+        if self._file is None:
+            self._file = tempfile.TemporaryFile(dir=self._directory)  # noqa: SIM115  # see `clear`
         self._file.seek(self._write_at)
-        self._file.write(record)
-        self._write_at += len(record)
-        self._lengths.append(len(record))
+        for part in parts:
+            self._file.write(part)
+        self._write_at += length
+        self._lengths.append(tuple(map(len, parts)))
         return True
 
     def get(self) -> Entry:
-        """Return the oldest entry and forget it.
+        """Return the oldest entry and forget it; its arrays are read-only, as they were.
 
         Raises:
             IndexError: If there is none.
         """
-        length = self._lengths.popleft()
+        if self._file is None:
+            raise IndexError("the spool is empty")
+        lengths = self._lengths.popleft()
         self._file.seek(self._read_at)
-        entry: Entry = pickle.loads(self._file.read(length))  # noqa: S301  # written above
-        self._read_at += length
+        head, *buffers = [self._file.read(length) for length in lengths]
+        entry: Entry = pickle.loads(head, buffers=buffers)  # noqa: S301  # written above
+        self._read_at += sum(lengths)
         if not self._lengths:
             self.clear()
         return entry
@@ -69,9 +77,6 @@ class DiskSpool:
         """Forget all entries and give their space back."""
         self._lengths.clear()
         self._read_at = self._write_at = 0
-        self._file.truncate(0)
-
-    def close(self) -> None:
-        """Give up the file."""
-        self._lengths.clear()
-        self._file.close()
+        if self._file is not None:
+            self._file.close()
+            self._file = None
