@@ -88,7 +88,6 @@ def _placed(graph: G2oGraph, path: Path) -> dict[int, FloatArray]:
 def _relative_edges(graph: G2oGraph, numbers: IntArray, path: Path) -> Edges:
     a, b = graph.ends.T
     return Edges(
-        id=np.zeros((len(a), 16), dtype=np.uint8),
         kind=np.where(np.abs(b - a) == 1, "odometry", "loop").astype(object),
         vertex_a=np.searchsorted(numbers, a),
         vertex_b=np.searchsorted(numbers, b),
@@ -100,7 +99,6 @@ def _relative_edges(graph: G2oGraph, numbers: IntArray, path: Path) -> Edges:
 
 def _fixed_edges(rows: IntArray, T_map_base: FloatArray) -> Edges:
     return Edges(
-        id=np.zeros((len(rows), 16), dtype=np.uint8),
         kind=np.full(len(rows), "fixed", dtype=object),
         vertex_a=rows,
         vertex_b=np.full(len(rows), -1),

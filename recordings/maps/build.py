@@ -113,7 +113,6 @@ def add_edges(map_: Map, edges: Sequence[RelativePose]) -> Map:
     rows_a = _rows_at(map_, [e.mission_a for e in edges], [e.stamp_a_ns for e in edges])
     rows_b = _rows_at(map_, [e.mission_b for e in edges], [e.stamp_b_ns for e in edges])
     added = Edges(
-        id=np.zeros((len(edges), 16), dtype=np.uint8),
         kind=np.array([e.kind for e in edges], dtype=object),
         vertex_a=rows_a,
         vertex_b=rows_b,

@@ -154,8 +154,8 @@ class Edges(Table):
     meaning: ClassVar[str] = "A constraint between two vertices, or on one."
 
     id: IdArray = _column(
-        "uint8", "from kind, source, vertices, and how many such edges come before", (16,)
-    )
+        "uint8", "from kind, source, vertices, and how many such edges come before", (16,), fill=0
+    )  # `build.append_edges` gives it
     kind: TextArray = _column(
         "text", "odometry, loop, imu, absolute, fixed ...; unknown kinds are kept as they are"
     )

@@ -80,7 +80,6 @@ def full_map() -> Map:
     map_ = line_map(6)
     imu_rows = np.arange(5)
     imu = Edges(
-        id=np.zeros((5, 16), dtype=np.uint8),
         kind=np.array(["imu"] * 5, dtype=object),
         vertex_a=imu_rows,
         vertex_b=imu_rows + 1,
