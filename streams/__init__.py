@@ -1,1 +1,83 @@
 """What flows between operators and what it flows through."""
+
+from mapstream.streams.channel import Channel, Limits, Receiver, Sender
+from mapstream.streams.clock import Clock, ReplayClock, TestClock, WallClock
+from mapstream.streams.errors import MappingError
+from mapstream.streams.geometry import SE3
+from mapstream.streams.messages.estimates import (
+    ImageFeatures,
+    Keyframe,
+    LoopCandidate,
+    LoopReport,
+    MapCorrection,
+    Odometry,
+    PointCloud,
+    RelativePose,
+    Submap,
+)
+from mapstream.streams.messages.sensors import (
+    CameraFrame,
+    EncodedImage,
+    GnssFix,
+    ImuBatch,
+    LaserScan2D,
+    LidarScan,
+    Message,
+    RecordRef,
+    TransformBatch,
+    WheelOdometry,
+)
+from mapstream.streams.sync import (
+    anchored,
+    approximate,
+    cut_imu,
+    exact,
+    interpolate,
+    latest,
+    merge,
+    nearest,
+    window,
+)
+from mapstream.streams.trajectory import Trajectory
+
+__all__ = [
+    "SE3",
+    "CameraFrame",
+    "Channel",
+    "Clock",
+    "EncodedImage",
+    "GnssFix",
+    "ImageFeatures",
+    "ImuBatch",
+    "Keyframe",
+    "LaserScan2D",
+    "LidarScan",
+    "Limits",
+    "LoopCandidate",
+    "LoopReport",
+    "MapCorrection",
+    "MappingError",
+    "Message",
+    "Odometry",
+    "PointCloud",
+    "Receiver",
+    "RecordRef",
+    "RelativePose",
+    "ReplayClock",
+    "Sender",
+    "Submap",
+    "TestClock",
+    "Trajectory",
+    "TransformBatch",
+    "WallClock",
+    "WheelOdometry",
+    "anchored",
+    "approximate",
+    "cut_imu",
+    "exact",
+    "interpolate",
+    "latest",
+    "merge",
+    "nearest",
+    "window",
+]
