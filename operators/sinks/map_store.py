@@ -10,7 +10,14 @@ import anyio
 import numpy as np
 from pydantic import Field
 
-from mapstream.operators.operator import NoPorts, Operator, OperatorConfig, offload, warn
+from mapstream.operators.operator import (
+    NoPorts,
+    Operator,
+    OperatorConfig,
+    context,
+    offload,
+    warn,
+)
 from mapstream.recordings.cloud_store import CloudStore, cloud_key
 from mapstream.recordings.maps.build import add_resources
 from mapstream.recordings.maps.combine import merge_maps
@@ -55,7 +62,7 @@ class MapStore(Operator[Inputs, NoPorts]):
     async def run(self, inputs: Inputs, outputs: NoPorts) -> None:  # noqa: ARG002  # a sink
         folder = self.config.path
         with FolderLock(folder) as lock:
-            self._base = await offload(self._open, folder)
+            self._base = await offload(self._open, folder, context().name)
             async with anyio.create_task_group() as tasks:
                 if inputs.submaps is not None:
                     tasks.start_soon(self._write_clouds, inputs.submaps)
@@ -67,7 +74,7 @@ class MapStore(Operator[Inputs, NoPorts]):
                 await offload(self._save, self._newest, lock)
             await offload(self._remove_loose_clouds, folder)
 
-    def _open(self, folder: Path) -> Map:
+    def _open(self, folder: Path, name: str) -> Map:
         """Return the map to merge new ones with; an empty one where they stand alone.
 
         Raises:
@@ -82,8 +89,8 @@ class MapStore(Operator[Inputs, NoPorts]):
             return Map.empty()
         if self.config.on_existing == "error":
             raise MapError(
-                f"{folder}: there is a map already; choose another folder, or set on_existing of the"
-                " map_store to replace or to merge (--set store.on_existing=replace)"
+                f"{folder}: there is a map already; choose another folder, or replace it"
+                f" (--set {name}.on_existing=replace), or merge with it (=merge)"
             )
         return load_map(folder) if self.config.on_existing == "merge" else Map.empty()
 

@@ -89,7 +89,9 @@ async def test_an_existing_map_is_not_touched_by_default(tmp_path: Path) -> None
     await store(tmp_path, submaps([3], with_clouds=True))
     before = files_under(tmp_path)
 
-    with pytest.raises(MapError, match=f"{tmp_path}: there is a map already.*on_existing=replace"):
+    with pytest.raises(
+        MapError, match=f"{tmp_path}: there is a map already.*--set store.on_existing=replace"
+    ):
         await store(tmp_path, submaps([5], OTHER_MISSION))
 
     assert files_under(tmp_path) == before
