@@ -128,19 +128,19 @@ class Receiver(Generic[T_co]):
         channel = self.channel
         items = channel.items
         while True:
-            if items and channel.is_simple and not channel.num_marks:
-                self._last = items.popleft()
+            if items and channel.gives_freely:
+                self._last = entry = items.popleft()
                 channel.stats.received += 1
-                if channel.senders.futures:
+                if channel.senders:
                     channel.senders.wake()
-                message: T_co = self._last[0]
+                message: T_co = entry[0]
                 return message
             found = self.try_receive()
             if found is not None:
                 return found
             if self.has_ended:
                 raise StopAsyncIteration
-            await Waiters.wait_any([channel.readers])
+            await channel.readers.wait()
 
     async def enter_next_epoch(self) -> bool:
         """Leave what is left of this epoch behind; False if the stream ended instead."""
@@ -153,7 +153,7 @@ class Receiver(Generic[T_co]):
                 return True
             if channel.is_closed:
                 return False
-            await Waiters.wait_any([channel.readers])
+            await channel.readers.wait()
 
     def close(self) -> None:
         """Receive nothing more; what is queued and what follows is counted as unread."""

@@ -58,9 +58,13 @@ class Channel(Generic[T]):
         self._queued_epoch = 0  # the newest whose mark is not in the overflow
         self.num_marks = 0  # of epochs, in the queue
         # Without byte limit, age limit and overflow, taking a message is a popleft.
-        self.is_simple = (
+        self._is_simple = (
             overflow is None and self.limits.max_bytes is None and self.limits.max_age_ns is None
         )
+        self._takes_offers = self._is_simple  # until closed or abandoned
+        self.gives_freely = self._is_simple  # while no epoch mark is queued
+        self._lateness_ns = self.limits.lateness_ns
+        self._max_bytes = self.limits.max_bytes
         if self.limits.policy == "spool" and overflow is None:
             raise ValueError(f"channel {name}: the policy spool needs a place for the overflow")
 
@@ -77,7 +81,7 @@ class Channel(Generic[T]):
 
     def _is_full(self) -> bool:
         num_messages = len(self.items) - self.num_marks
-        limit = self.limits.max_bytes
+        limit = self._max_bytes
         return num_messages >= self.capacity or (
             limit is not None and self._num_bytes >= limit and num_messages > 0
         )
@@ -90,22 +94,32 @@ class Channel(Generic[T]):
         """Queue one message if there is plainly room; False if `put` has to wait or to decide."""
         items = self.items
         depth = len(items)
-        if depth >= self.capacity or not self.is_simple or self.is_closed or self.is_abandoned:
+        if depth >= self.capacity or not self._takes_offers:
             return False
         stats = self.stats
         stamp_ns = message.stamp_ns
-        self._move_bound(stamp_ns)
+        bound_ns = (
+            stamp_ns - self._lateness_ns
+        )  # as `_move_bound`; a call costs as much as the rest
+        if bound_ns > self.bound_ns:
+            self.bound_ns = bound_ns
+        else:
+            if stamp_ns < self.bound_ns:
+                stats.late += 1
+            bound_ns = self.bound_ns
         sequence = stats.sent
         stats.sent = sequence + 1
-        items.append((message, sequence, _monotonic_ns(), stamp_ns, self.bound_ns))
+        items.append((message, sequence, _monotonic_ns(), stamp_ns, bound_ns))
         if depth >= stats.high_water:
             stats.high_water = depth + 1
-        if self.readers.futures or self.receivers.futures:
-            self._wake_receivers()
+        if self.readers:
+            self.readers.wake()
+        if self.receivers:
+            self.receivers.wake()
         return True
 
     def _move_bound(self, stamp_ns: int) -> None:
-        bound_ns = stamp_ns - self.limits.lateness_ns
+        bound_ns = stamp_ns - self._lateness_ns
         if bound_ns > self.bound_ns:
             self.bound_ns = bound_ns
         elif stamp_ns < self.bound_ns:
@@ -134,12 +148,13 @@ class Channel(Generic[T]):
                 return
         if self.is_abandoned:
             stats.dropped["unread"] += 1
+            await anyio.lowlevel.checkpoint()  # a sender that never waits must not starve the rest
         else:
             self._append((message, sequence, _monotonic_ns(), stamp_ns, self.bound_ns))
 
     async def _wait_for_room(self, started_ns: int) -> None:
         while self._is_full() and not self.is_abandoned:
-            await Waiters.wait_any([self.senders])
+            await self.senders.wait()
         self.stats.blocked_ns += _monotonic_ns() - started_ns
 
     async def _make_room(self, entry: Entry) -> bool:
@@ -160,6 +175,7 @@ class Channel(Generic[T]):
         self.items.append(entry)
         if isinstance(entry[0], EpochMark):
             self.num_marks += 1
+            self.gives_freely = False
             self._queued_epoch = entry[0].epoch
         if self.limits.max_bytes is not None:
             self._num_bytes += nbytes(entry[0])
@@ -178,6 +194,7 @@ class Channel(Generic[T]):
         entry = self.items.popleft()
         if isinstance(entry[0], EpochMark):
             self.num_marks -= 1
+            self.gives_freely = self._is_simple and self.num_marks == 0
         if self.limits.max_bytes is not None:
             self._num_bytes -= nbytes(entry[0])
         self._refill()
@@ -192,7 +209,7 @@ class Channel(Generic[T]):
         """Promise that no message older than `bound_ns` will follow."""
         if bound_ns > self.bound_ns:
             self.bound_ns = bound_ns
-            if self.receivers.futures:
+            if self.receivers:
                 self.receivers.wake()
 
     def start_epoch(self) -> None:
@@ -210,11 +227,13 @@ class Channel(Generic[T]):
     def close(self) -> None:
         """End the stream; the receiver still gets what is queued."""
         self.is_closed = True
+        self._takes_offers = False
         self._wake_receivers()
 
     def abandon(self) -> None:
         """Stop receiving; what is queued and what follows is counted as unread."""
         self.is_abandoned = True
+        self._takes_offers = False
         num_marks = self.num_marks + self._epoch - self._queued_epoch
         self.stats.dropped["unread"] += len(self) - num_marks
         self.items.clear()
@@ -227,10 +246,12 @@ class Channel(Generic[T]):
     def grow(self, capacity: int) -> None:
         """Hold more messages: the way out of a deadlock by a full channel (Parks, section 4.2)."""
         self.capacity = capacity
+        if self._max_bytes is not None:
+            self._max_bytes *= 2
         self.stats.grown += 1
         self._refill()
         self.senders.wake()
 
     async def wait_changed(self) -> None:
         """Wait until a message, a new bound or the end comes."""
-        await Waiters.wait_any([self.receivers])
+        await self.receivers.wait()
