@@ -10,9 +10,11 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any
 
+from mapstream.recordings import message_codec
 from mapstream.recordings.decoding import foxglove, ros, ros_clouds, ros_images
 from mapstream.recordings.decoding.cursor import CdrCursor, Ros1Cursor
 from mapstream.recordings.decoding.decoder import Decoder, Parse
+from mapstream.recordings.message_schema import PACKAGE
 from mapstream.recordings.recording import Channel
 from mapstream.streams.errors import DecodeError
 from mapstream.streams.messages.estimates import Odometry
@@ -72,6 +74,9 @@ def decoder_for(channel: Channel, message_type: type[Any] | None = None) -> Deco
         DecodeError: If the schema or the encoding is not known, or does not give that type.
     """
     name, encoding = schema_key(channel), channel.message_encoding
+    if encoding == "protobuf" and name.startswith(f"{PACKAGE}."):
+        own_type, decode = message_codec.decoder(name, channel.schema_data)
+        return Decoder(channel, own_type, decode)
     table = _FOXGLOVE if encoding in ("protobuf", "json") else _ROS
     found = [(t, read) for n, t, read in table if n == name]
     if encoding not in ("cdr", "ros1", "protobuf", "json"):
