@@ -10,7 +10,7 @@ from typing import Self
 
 from mapstream.streams.errors import MapError
 
-LOCK = ".lock"
+LOCK = ".mapstream.lock"
 TEMPORARY = ".part"  # suffix of what is not yet written whole
 
 

@@ -13,7 +13,7 @@ from mapstream.operators.testing import run_operator
 from mapstream.recordings.cloud_store import read_cloud
 from mapstream.recordings.maps import Map, check_map, load_map
 from mapstream.recordings.maps.build import append_submap
-from mapstream.recordings.maps.folder import FolderLock
+from mapstream.recordings.maps.folder import LOCK, FolderLock
 from mapstream.streams.errors import MapError
 from mapstream.streams.messages.estimates import Submap
 from tests.recordings.made_maps import (
@@ -66,7 +66,7 @@ async def test_two_runs_leave_the_same_bytes(tmp_path: Path) -> None:
     await store(tmp_path / "b", parts)
 
     first, second = files_under(tmp_path / "a"), files_under(tmp_path / "b")
-    del first[".lock"], second[".lock"]
+    del first[LOCK], second[LOCK]
     assert first == second
 
 

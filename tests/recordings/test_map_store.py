@@ -18,7 +18,7 @@ import pytest
 
 from mapstream.recordings.maps import Map, load_map, save_map
 from mapstream.recordings.maps.combine import with_journal_entry
-from mapstream.recordings.maps.folder import FolderLock
+from mapstream.recordings.maps.folder import LOCK, FolderLock
 from mapstream.streams.errors import MapError, MapFormatError
 from tests.recordings.made_maps import files_under, full_map, line_map
 
@@ -48,8 +48,8 @@ def test_S1_save_load_save_loses_nothing(map_: Map, tmp_path: Path) -> None:
 
     assert loaded.digest() == map_.digest()
     first, second = files_under(tmp_path / "a"), files_under(tmp_path / "b")
-    assert first.pop(".lock") is not None
-    assert second.pop(".lock") is not None
+    assert first.pop(LOCK) is not None
+    assert second.pop(LOCK) is not None
     assert first == second
 
 
