@@ -76,6 +76,7 @@ class Activity:
     position_ns: int | None = None  # of a source: log time
     span_ns: tuple[int, int] | None = None  # of a source: first and last log time
     warnings: dict[str, int] = field(default_factory=dict)  # message -> how often
+    losses: dict[str, int] = field(default_factory=dict)  # the same, of data that is gone
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,6 +114,15 @@ def warn(message: str) -> None:
     """Count something that the user should know, though the run goes on; shown in the report."""
     warnings = context().activity.warnings
     warnings[message] = warnings.get(message, 0) + 1
+
+
+def report_loss(message: str) -> None:
+    """Count data that was there and could not be used, a damaged chunk for instance.
+
+    The run goes on, and ends as `lossy`.
+    """
+    losses = context().activity.losses
+    losses[message] = losses.get(message, 0) + 1
 
 
 async def offload(function: Callable[..., R], *args: object) -> R:

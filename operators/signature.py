@@ -29,6 +29,12 @@ class Signature:
     outputs_type: type[Any]
     inputs: dict[str, Port]
     outputs: dict[str, Port]
+    takes_config: bool  # its `__init__` has a parameter `config`
+
+    def make(self, config: OperatorConfig) -> Operator[Any, Any]:
+        """Return a new operator."""
+        arguments = {"config": config} if self.takes_config else {}
+        return self.operator_type(**arguments)
 
 
 def signature_of(
@@ -60,6 +66,7 @@ def signature_of(
         outputs_type=outputs_type,
         inputs=inputs,
         outputs=outputs,
+        takes_config="config" in hints,
     )
 
 

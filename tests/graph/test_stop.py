@@ -1,0 +1,91 @@
+"""Ending a run early: the first request drains and saves, the second quits."""
+
+from __future__ import annotations
+
+import os
+import signal
+from collections.abc import Iterator
+from pathlib import Path
+
+import anyio
+import pytest
+
+from mapstream.graph.report import RunReport
+from mapstream.graph.run import run_graph
+from mapstream.graph.stop import Stop, on_signals
+from tests.graph.made_plans import chain, node
+from tests.graph.operators_for_tests import COLLECTED, GATES, Collect, Digest, Source, Step
+
+pytestmark = pytest.mark.anyio
+
+
+@pytest.fixture(autouse=True)
+def _nothing_kept() -> Iterator[None]:
+    yield
+    COLLECTED.clear()
+    GATES.clear()
+
+
+async def test_B18_a_request_stops_sources_and_what_is_queued_is_finished(tmp_path: Path) -> None:
+    """The source has no end, the step waits at a gate with a full queue; all that was sent is saved."""
+    GATES["open"] = anyio.Event()
+    stop = Stop()
+    reports: list[RunReport] = []
+    plan = chain(
+        source=node(Source, is_endless=True),
+        step=node(Step, gate="open"),
+        sink=node(Digest, path=tmp_path / "digest"),
+    )
+
+    async def run() -> None:
+        reports.append(await run_graph(plan, stop=stop))
+
+    async with anyio.create_task_group() as tasks:
+        tasks.start_soon(run)
+        await anyio.wait_all_tasks_blocked()
+        stop.request()
+        await anyio.wait_all_tasks_blocked()
+        GATES["open"].set()
+
+    (report,) = reports
+    assert report.status == "complete"
+    assert report.was_stopped
+    sent = report.final.edges[0].sent
+    assert sent >= 8
+    count = int((tmp_path / "digest").read_text().split()[0])
+    assert count == report.final.edges[0].received
+    assert sent - count <= 1  # the message that the source still held
+
+
+async def test_B18_a_second_request_quits_at_once() -> None:
+    GATES["open"] = anyio.Event()
+    stop = Stop()
+    reports: list[RunReport] = []
+    plan = chain(
+        source=node(Source, is_endless=True), step=node(Step, gate="open"), sink=node(Collect)
+    )
+
+    async def run() -> None:
+        reports.append(await run_graph(plan, stop=stop))
+
+    async with anyio.create_task_group() as tasks:
+        tasks.start_soon(run)
+        await anyio.wait_all_tasks_blocked()
+        stop.request()
+        await anyio.wait_all_tasks_blocked()
+        stop.request()
+
+    (report,) = reports
+    assert report.status == "failed"
+    assert "second request" in report.reasons[0]
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+async def test_B18_signals_are_requests(number: signal.Signals) -> None:
+    stop = Stop()
+
+    async with on_signals(stop):
+        os.kill(os.getpid(), number)
+        await stop.wait_first()
+
+    assert stop.is_requested
