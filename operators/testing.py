@@ -21,11 +21,16 @@ async def run_operator(
 ) -> dict[str, list[Any]]:
     """Feed each input port its messages, run the operator to its end, return what each output sent.
 
+    Optional ports that get no messages stay unconnected.
+
     `config` is needed only for an operator whose config names its ports.
     """
     signature = signature_of(type(operator), config)
-    receivers: dict[str, Receiver[Any]] = {}
-    for port in signature.inputs:
+    receivers: dict[str, Receiver[Any] | None] = {}
+    for port, declared in signature.inputs.items():
+        if declared.is_optional and port not in inputs:
+            receivers[port] = None
+            continue
         channel: Channel[Any] = Channel(port, _UNBOUNDED)
         for message in inputs.get(port, ()):
             await channel.put(message)

@@ -47,6 +47,7 @@ class PointCloud:
     stamp_ns: int
     points: Float32Array  # (N, 3) [m]
     intensity: Float32Array | None = None  # (N,)
+    record: RecordRef | None = None  # the raw measurement it was made from
 
     def __post_init__(self) -> None:
         n = frozen(self, "points", np.float32, (None, 3)).shape[0]
@@ -77,7 +78,10 @@ class RelativePose:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Keyframe:
-    """A moment worth a vertex, with what was seen at it."""
+    """A moment worth a vertex, with what was seen at it.
+
+    The covariance of its odometry is that of the step since the keyframe before; the first has none.
+    """
 
     stamp_ns: int
     odometry: Odometry
@@ -97,7 +101,6 @@ class Submap:
     index: int  # 0, 1, 2 ... within the mission
     keyframes: tuple[Keyframe, ...]
     edges: tuple[RelativePose, ...]
-    is_last: bool = False
 
     def __post_init__(self) -> None:
         if not self.keyframes:

@@ -117,7 +117,6 @@ def one_of_each(seed: int) -> list[Any]:
         odometry, cloud, edge, keyframe,
         Submap(
             mission_id=mission, index=n, keyframes=(keyframe,) * (n + 1), edges=(edge,) * n,
-            is_last=bool(n % 2),
         ),
         LoopReport(
             stamp_ns=stamp, edges=(edge,) * n,

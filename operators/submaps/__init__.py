@@ -1,0 +1,1 @@
+"""From odometry to keyframes, and from keyframes to submaps."""

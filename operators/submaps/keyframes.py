@@ -1,0 +1,121 @@
+"""Choose the moments that become vertices of the map."""
+
+from __future__ import annotations
+
+from collections.abc import AsyncIterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+from pydantic import PositiveFloat
+
+from mapstream.operators.operator import Operator, OperatorConfig, warn
+from mapstream.streams.channel import Receiver, Sender
+from mapstream.streams.messages.estimates import Keyframe, Odometry, PointCloud
+from mapstream.streams.messages.sensors import FloatArray
+from mapstream.streams.sync import exact
+
+
+class KeyframesConfig(OperatorConfig):
+    """Options of `keyframes`: what the robot must have done since the last keyframe, at least one of it."""
+
+    distance_m: PositiveFloat = 1.0
+    rotation_rad: PositiveFloat = 0.35
+    period_s: PositiveFloat | None = None  # also while it stands still
+    odometry_sigma_rad: PositiveFloat = 0.002  # a step's, where the odometry says nothing
+    odometry_sigma_m: PositiveFloat = 0.01
+
+
+@dataclass(frozen=True)
+class Inputs:
+    """Odometry, and the clouds that have its stamps."""
+
+    odometry: Receiver[Odometry]
+    clouds: Receiver[PointCloud] | None
+
+
+@dataclass(frozen=True)
+class Outputs:
+    """Some of the moments of the odometry."""
+
+    keyframes: Sender[Keyframe]
+
+
+class Keyframes(Operator[Inputs, Outputs]):
+    """Keep a moment when the robot has moved, turned or waited enough since the one before.
+
+    The first and the last moment are always kept, so that the map spans the drive.
+    Uncertainty is gathered from keyframe to keyframe over all odometry between.
+    """
+
+    def __init__(self, config: KeyframesConfig) -> None:
+        self._config = config
+        sigmas = [config.odometry_sigma_rad] * 3 + [config.odometry_sigma_m] * 3
+        self._default_covariance = np.diag(np.square(sigmas))
+        self._kept: Odometry | None = None  # the last keyframe
+        self._previous: Odometry | None = None  # the last message
+        self._covariance: FloatArray = np.zeros(
+            (6, 6)
+        )  # of the step from the kept one to the previous
+        self._was_lost = False
+
+    async def run(self, inputs: Inputs, outputs: Outputs) -> None:
+        waiting: Keyframe | None = None  # the newest moment, not kept so far
+        async for odometry, cloud in _moments(inputs):
+            keyframe = self.moment(odometry, cloud)
+            waiting = keyframe
+            if self.is_due(odometry):
+                self.keep(odometry)
+                waiting = None
+                await outputs.keyframes.send(keyframe)
+        if waiting is not None:
+            await outputs.keyframes.send(waiting)
+
+    def moment(self, odometry: Odometry, cloud: PointCloud | None) -> Keyframe:
+        """Return the keyframe that this moment would be."""
+        if self._previous is None:
+            covariance = None
+        else:
+            T_previous_now = self._previous.T_odom_base.inverse() @ odometry.T_odom_base
+            step = odometry.covariance
+            carried = T_previous_now.inverse().adjoint()
+            self._covariance = carried @ self._covariance @ carried.T
+            self._covariance += self._default_covariance if step is None else step
+            self._was_lost |= odometry.is_lost
+            covariance = self._covariance.copy()
+        self._previous = odometry
+        records = (cloud.record,) if cloud is not None and cloud.record is not None else ()
+        since_kept = replace(odometry, covariance=covariance, is_lost=self._was_lost)
+        return Keyframe(
+            stamp_ns=odometry.stamp_ns, odometry=since_kept, cloud=cloud, records=records
+        )
+
+    def is_due(self, odometry: Odometry) -> bool:
+        """Return whether enough happened since the last keyframe."""
+        if self._kept is None:
+            return True
+        step = self._kept.T_odom_base.inverse() @ odometry.T_odom_base
+        waited_s = (odometry.stamp_ns - self._kept.stamp_ns) / 1e9
+        return (
+            float(np.linalg.norm(step.t)) >= self._config.distance_m
+            or step.angle_rad >= self._config.rotation_rad
+            or (self._config.period_s is not None and waited_s >= self._config.period_s)
+        )
+
+    def keep(self, odometry: Odometry) -> None:
+        """Measure from this moment on."""
+        self._kept = odometry
+        self._covariance = np.zeros((6, 6))
+        self._was_lost = False
+
+
+async def _moments(inputs: Inputs) -> AsyncIterator[tuple[Odometry, PointCloud | None]]:
+    """Yield odometry with its cloud; without clouds, alone."""
+    if inputs.clouds is None:
+        async for odometry in inputs.odometry:
+            yield odometry, None
+        return
+    pairs = exact(inputs.odometry, inputs.clouds)
+    async for odometry, cloud in pairs:
+        yield odometry, cloud
+    if pairs.stats.unmatched:
+        warn(f"keyframes: {pairs.explain()}")
