@@ -33,10 +33,11 @@ def straight(num: int, step_m: float = 0.1) -> list[Odometry]:
     ]
 
 
-def chosen(config: KeyframesConfig, odometry: list[Odometry], **more: Any  # noqa: ANN401) -> list[Keyframe]:
-    return anyio.run(lambda: run_operator(Keyframes(config), odometry=odometry, **more))[
-        "keyframes"
-    ]
+def chosen(
+    config: KeyframesConfig, odometry: list[Odometry], clouds: list[PointCloud] | None = None
+) -> list[Keyframe]:
+    more: dict[str, Any] = {"odometry": odometry} | ({"clouds": clouds} if clouds else {})
+    return anyio.run(lambda: run_operator(Keyframes(config), **more))["keyframes"]
 
 
 def test_G7_a_keyframe_every_metre_and_both_ends() -> None:
@@ -91,7 +92,9 @@ def test_G3_gathered_covariance_is_that_of_monte_carlo() -> None:
         [SE3(e).log() for e in odometry[-1].T_odom_base.inverse().matrix @ ends[:4000]]
     )
 
-    gathered = chosen(KeyframesConfig(distance_m=100, rotation_rad=10), odometry)[-1].odometry.covariance
+    gathered = chosen(KeyframesConfig(distance_m=100, rotation_rad=10), odometry)[
+        -1
+    ].odometry.covariance
 
     assert gathered is not None
     np.testing.assert_allclose(gathered, np.cov(errors.T), atol=0.08 * gathered.max())
