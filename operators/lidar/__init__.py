@@ -1,0 +1,1 @@
+"""Work on LiDAR points: sampling, motion compensation, registration, loop closure."""

@@ -1,0 +1,1 @@
+"""Odometry: how the base moved from message to message."""
