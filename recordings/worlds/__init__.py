@@ -1,0 +1,1 @@
+"""Synthetic recordings: worlds of triangles, driven through and seen by simulated sensors."""

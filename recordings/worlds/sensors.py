@@ -1,0 +1,140 @@
+"""Simulated sensors: a spinning LiDAR, an IMU and an odometry that drifts."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, NonNegativeFloat, PositiveFloat, PositiveInt
+
+from mapstream.recordings.worlds.motion import Motion
+from mapstream.recordings.worlds.ray_caster import RayCaster
+from mapstream.streams.geometry import SE3, invert, se3_exp
+from mapstream.streams.messages.estimates import Odometry
+from mapstream.streams.messages.sensors import FloatArray, ImuBatch, IntArray, LidarScan
+
+
+class LidarConfig(BaseModel):
+    """A spinning LiDAR: all beams of a column fire at once, columns one after the other."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    beams: PositiveInt = 32
+    columns: PositiveInt = 512
+    rate_hz: PositiveFloat = 10.0
+    vertical_fov_rad: PositiveFloat = float(np.deg2rad(45))
+    min_range_m: NonNegativeFloat = 0.4
+    max_range_m: PositiveFloat = 60.0
+    range_noise_m: NonNegativeFloat = 0.01
+    dropout: NonNegativeFloat = 0.005  # share of returns that are lost
+
+
+class ImuConfig(BaseModel):
+    """Noise of an IMU; densities as in its data sheet."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    rate_hz: PositiveFloat = 200.0
+    gyro_noise_radps_rthz: NonNegativeFloat = 1.7e-4
+    accel_noise_mps2_rthz: NonNegativeFloat = 2.0e-3
+    gyro_bias_radps: NonNegativeFloat = 2.0e-3  # standard deviation at the start, each axis
+    accel_bias_mps2: NonNegativeFloat = 2.0e-2
+    gyro_walk_radps2_rthz: NonNegativeFloat = 2.0e-5
+    accel_walk_mps3_rthz: NonNegativeFloat = 3.0e-4
+
+
+class Lidar:
+    """Casts each column from where the sensor is at its time, so that sweeps are distorted by motion."""
+
+    def __init__(self, config: LidarConfig, T_base_sensor: SE3, rng: np.random.Generator) -> None:
+        self.config = config
+        self.T_base_sensor = T_base_sensor
+        self._rng = rng
+        self.period_ns = round(1e9 / config.rate_hz)
+        self._offsets_ns = np.arange(config.columns) * self.period_ns // config.columns
+        azimuth = 2 * np.pi * np.arange(config.columns) / config.columns
+        half = config.vertical_fov_rad / 2
+        elevation = np.linspace(-half, half, config.beams)
+        cosine = np.cos(elevation)
+        self._rays = np.stack(  # (columns, beams, 3) in the sensor's frame
+            [
+                np.cos(azimuth)[:, None] * cosine,
+                np.sin(azimuth)[:, None] * cosine,
+                np.broadcast_to(np.sin(elevation), (config.columns, config.beams)),
+            ],
+            axis=-1,
+        )
+        self._ring = np.tile(np.arange(config.beams, dtype=np.uint16), config.columns)
+
+    def scan(self, caster: RayCaster, motion: Motion, stamp_ns: int) -> LidarScan:
+        """Return the sweep that begins at `stamp_ns`."""
+        config, rng = self.config, self._rng
+        T_world_sensor = motion.poses(stamp_ns + self._offsets_ns) @ self.T_base_sensor.matrix
+        R = T_world_sensor[:, :3, :3]
+        directions = (self._rays @ np.swapaxes(R, 1, 2)).reshape(-1, 3)
+        hits = caster.cast(np.repeat(T_world_sensor[:, :3, 3], config.beams, axis=0), directions)
+        ranges = hits.ranges_m + rng.normal(0.0, config.range_noise_m, len(directions))
+        seen = (ranges >= config.min_range_m) & (ranges <= config.max_range_m)
+        seen &= rng.random(len(directions)) >= config.dropout
+        faces = hits.faces[seen]
+        incidence = np.abs(np.einsum("ij,ij->i", directions[seen], caster.normals[faces]))
+        intensity = np.rint(255 * caster.mesh.reflectivity[faces] * incidence)  # Lambert's law
+        return LidarScan(
+            stamp_ns=stamp_ns,
+            points=ranges[seen, None] * self._rays.reshape(-1, 3)[seen],
+            intensity=intensity,
+            ring=self._ring[seen],
+            offsets_ns=np.repeat(self._offsets_ns, config.beams)[seen],
+            T_base_sensor=self.T_base_sensor,
+        )
+
+
+def imu_batches(
+    config: ImuConfig, T_base_sensor: SE3, motion: Motion, rng: np.random.Generator
+) -> Iterator[ImuBatch]:
+    """Yield the samples of a whole motion, a tenth of a second at a time."""
+    period_ns = round(1e9 / config.rate_hz)
+    stamps_ns = np.arange(motion.start_ns, motion.end_ns + 1, period_ns)
+    shape, rate_hz = (len(stamps_ns), 3), config.rate_hz
+    gyro_radps = motion.angular_velocity(stamps_ns) @ T_base_sensor.R
+    gyro_radps += _bias(config.gyro_bias_radps, config.gyro_walk_radps2_rthz, rate_hz, shape, rng)
+    gyro_radps += rng.normal(0.0, config.gyro_noise_radps_rthz * np.sqrt(rate_hz), shape)
+    accel_mps2 = motion.specific_force(stamps_ns, T_base_sensor)
+    accel_mps2 += _bias(config.accel_bias_mps2, config.accel_walk_mps3_rthz, rate_hz, shape, rng)
+    accel_mps2 += rng.normal(0.0, config.accel_noise_mps2_rthz * np.sqrt(rate_hz), shape)
+    size = max(1, 10**8 // period_ns)
+    for start in range(0, len(stamps_ns), size):
+        rows = slice(start, start + size)
+        yield ImuBatch(
+            stamps_ns=stamps_ns[rows],
+            gyro_radps=gyro_radps[rows],
+            accel_mps2=accel_mps2[rows],
+            T_base_sensor=T_base_sensor,
+        )
+
+
+def _bias(
+    start: float, walk: float, rate_hz: float, shape: tuple[int, int], rng: np.random.Generator
+) -> FloatArray:
+    """Return a random walk (N, 3) from a random start, whose density is `walk`."""
+    steps = rng.normal(0.0, walk / np.sqrt(rate_hz), shape)
+    return rng.normal(0.0, start, 3) + np.cumsum(steps, axis=0)
+
+
+def drifting_odometry(
+    poses: FloatArray, stamps_ns: IntArray, drift: float, rng: np.random.Generator
+) -> Iterator[Odometry]:
+    """Yield odometry whose error grows by about `drift` of the distance.
+
+    Every step is stretched by a fixed factor, and turned by a random walk of the heading.
+    """
+    steps = invert(poses[:-1]) @ poses[1:]
+    lengths = np.linalg.norm(steps[:, :3, 3], axis=1)
+    errors = np.zeros((len(steps), 6))
+    errors[:, 2] = rng.normal(0.0, 0.1 * drift, len(steps)) * np.sqrt(lengths)
+    steps[:, :3, 3] *= 1 + drift * rng.choice([-1, 1])
+    T = poses[0]
+    yield Odometry(stamp_ns=int(stamps_ns[0]), T_odom_base=SE3(T))
+    for stamp_ns, step in zip(stamps_ns[1:], steps @ se3_exp(errors), strict=True):
+        T = T @ step
+        yield Odometry(stamp_ns=int(stamp_ns), T_odom_base=SE3(T))

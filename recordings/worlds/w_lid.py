@@ -1,0 +1,134 @@
+"""World W-LID: a LiDAR and an IMU driven once round a ring of corridors, and a little further."""
+
+from __future__ import annotations
+
+from heapq import merge
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, NonNegativeFloat, PositiveFloat
+
+from mapstream.recordings.worlds.corridor import Corridor
+from mapstream.recordings.worlds.motion import Motion
+from mapstream.recordings.worlds.ray_caster import RayCaster
+from mapstream.recordings.worlds.ring import MIN_LENGTH_M, Ring
+from mapstream.recordings.worlds.sensors import (
+    ImuConfig,
+    Lidar,
+    LidarConfig,
+    drifting_odometry,
+    imu_batches,
+)
+from mapstream.recordings.worlds.simulation import Record, Simulation
+from mapstream.streams.geometry import SE3
+from mapstream.streams.messages.estimates import Odometry
+from mapstream.streams.messages.sensors import FloatArray
+
+START_NS = 1_700_000_000 * 10**9
+T_BASE_LIDAR = SE3.exp(
+    [0.0, 0.05, 0.0, 0.2, 0.0, 1.1]
+)  # pitched, so that a forgotten extrinsic shows
+T_BASE_IMU = SE3.exp([0.0, 0.0, 0.0, 0.05, -0.03, 0.2])
+_KNOT_NS = 50_000_000  # between the points of the motion's spline
+_TRUTH_NS = 10_000_000
+_STAND_S = 1.0
+_RAMP_S = 2.5
+_SPIN_PERIOD_S = 9.0
+_CORNER_SPEED = 0.7  # of the speed on the straight
+
+
+class WLidConfig(BaseModel):
+    """Options of W-LID."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    length_m: float = Field(default=300.0, ge=MIN_LENGTH_M)  # once round
+    overlap_fraction: NonNegativeFloat = 0.08  # driven a second time
+    speed_mps: PositiveFloat = 2.8  # on the straight; corners are slower
+    odometry_drift: NonNegativeFloat = 0.005  # of the distance
+    aggressive: bool = False  # spins at 90 deg/s, to one side and the other
+    blank_walls: bool = False  # corridors that say nothing of the motion along them
+    lidar: LidarConfig = LidarConfig()
+    imu: ImuConfig = ImuConfig()
+
+
+def w_lid(config: WLidConfig, seed: int) -> Simulation:
+    """Return the recording of one drive; equal arguments give equal recordings.
+
+    Topics: `/points`, `/imu`, `/odometry` (drifts) and `/truth`, the pose of the base in the world,
+    which is where the base starts.
+    """
+    seeds = np.random.SeedSequence(seed).spawn(4)
+    world_rng, lidar_rng, imu_rng, odometry_rng = map(np.random.default_rng, seeds)
+    ring = Ring(config.length_m)
+    motion = drive(ring, config)
+    caster = RayCaster(Corridor(ring, world_rng, is_blank=config.blank_walls).mesh())
+    lidar = Lidar(config.lidar, T_BASE_LIDAR, lidar_rng)
+    stamps_ns = np.arange(motion.start_ns, motion.end_ns + 1, _TRUTH_NS)
+    poses = motion.poses(stamps_ns)
+    coarse = slice(None, None, 5)
+    truth = (_odometry(ns, T) for ns, T in zip(stamps_ns.tolist(), poses, strict=True))
+    odometry = drifting_odometry(
+        poses[coarse], stamps_ns[coarse], config.odometry_drift, odometry_rng
+    )
+    imu = imu_batches(config.imu, T_BASE_IMU, motion, imu_rng)
+    starts = range(motion.start_ns, motion.end_ns - lidar.period_ns + 1, lidar.period_ns)
+    scans = (lidar.scan(caster, motion, start) for start in starts)
+    return Simulation(
+        start_ns=motion.start_ns,
+        end_ns=motion.end_ns,
+        records=merge(
+            (Record(m.stamp_ns, "/imu", m) for m in imu),
+            (Record(m.stamp_ns, "/odometry", m) for m in odometry),
+            (Record(m.stamp_ns, "/truth", m) for m in truth),
+            (Record(m.stamp_ns + lidar.period_ns, "/points", m) for m in scans),
+            key=lambda record: record.log_ns,
+        ),
+    )
+
+
+def _odometry(stamp_ns: int, T_world_base: FloatArray) -> Odometry:
+    return Odometry(stamp_ns=stamp_ns, T_odom_base=SE3(T_world_base))
+
+
+def drive(ring: Ring, config: WLidConfig) -> Motion:
+    """Return the motion: a second at rest, gently off, and round the ring with the overlap."""
+    distance_m = ring.length_m * (1 + config.overlap_fraction)
+    s_m = _distances(ring, distance_m, config.speed_mps)
+    t_s = np.arange(len(s_m)) * _KNOT_NS / 1e9
+    ramp = np.clip((t_s - _STAND_S) / _RAMP_S, 0, 1)
+    moving = ramp * ramp * (3 - 2 * ramp)
+    sway = np.sin(2 * np.pi * s_m / 17.0)
+    positions = ring.points(s_m, 0.12 * sway, 0.004 * moving * np.sin(2 * np.pi * 1.7 * t_s))
+    rpy_rad = np.stack(
+        [
+            0.005 * moving * np.sin(2 * np.pi * 0.9 * t_s),
+            0.004 * moving * np.sin(2 * np.pi * 1.3 * t_s),
+            ring.headings(s_m) + 0.12 * np.sin(2 * np.pi * s_m / 17.0) * moving,
+        ],
+        axis=1,
+    )
+    if config.aggressive:
+        rpy_rad[:, 2] += _spins(t_s - _STAND_S - _RAMP_S)
+    stamps_ns = START_NS + np.arange(len(s_m)) * _KNOT_NS
+    return Motion(stamps_ns, positions, rpy_rad)
+
+
+def _distances(ring: Ring, distance_m: float, speed_mps: float) -> FloatArray:
+    """Return the distance driven at each knot [m]: from rest, slower in corners."""
+    s, distances, t = 0.0, [], 0.0
+    step_s = _KNOT_NS / 1e9
+    ahead = np.linspace(-1.5, 1.5, 7)
+    while s < distance_m:
+        distances.append(s)
+        bend = float(np.mean(ring.curvature(np.array(s) + ahead))) * ring.radius_m
+        speed = speed_mps * (1 - (1 - _CORNER_SPEED) * bend)
+        start = np.clip((t - _STAND_S) / _RAMP_S, 0, 1)
+        s += step_s * speed * start * start * (3 - 2 * start)
+        t += step_s
+    return np.array(distances)
+
+
+def _spins(t_s: FloatArray) -> FloatArray:
+    """Return headings [rad] of turns at 90 deg/s that change sides, from rest at t = 0."""
+    rate = np.where(t_s > 0, np.pi / 2 * np.tanh(6 * np.sin(2 * np.pi * t_s / _SPIN_PERIOD_S)), 0.0)
+    return np.cumsum(rate) * _KNOT_NS / 1e9
