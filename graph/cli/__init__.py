@@ -14,7 +14,6 @@ from typing import Any
 import typer
 
 from mapstream.graph.cli.output import ExitCode, complain
-from mapstream.streams.errors import ConfigError, MappingError
 
 _TRACEBACK = "MAPSTREAM_TRACEBACK"  # the environment variable
 VERBS = {  # verb -> function or group of commands, and what a list of verbs says of it
@@ -40,20 +39,24 @@ def main(arguments: Sequence[str] | None = None) -> None:
     words = list(sys.argv[1:] if arguments is None else arguments)
     try:
         command_line(words)(args=words, prog_name="mapstream")
-    except ConfigError as error:
-        complain(str(error))
-        raise SystemExit(ExitCode.UNUSABLE) from None
-    except MappingError as error:
-        complain(str(error))
-        raise SystemExit(ExitCode.FAILED) from None
-    except BrokenPipeError:  # `mapstream info x | head`
-        raise SystemExit(ExitCode.FAILED) from None
     except Exception as error:
         if os.environ.get(_TRACEBACK):
             raise
-        complain(f"mapstream has a mistake of its own: {type(error).__name__}: {error}")
-        complain(f"{_TRACEBACK}=1 shows where; please report it with what you did")
-        raise SystemExit(ExitCode.FAILED) from error
+        raise SystemExit(_explain(error)) from error
+
+
+def _explain(error: Exception) -> ExitCode:
+    """Say what went wrong, and return how to leave."""
+    from mapstream.streams.errors import ConfigError, MappingError  # noqa: PLC0415  # brings numpy
+
+    if isinstance(error, BrokenPipeError):  # `mapstream info x | head`
+        return ExitCode.FAILED
+    if isinstance(error, MappingError):
+        complain(str(error))
+        return ExitCode.UNUSABLE if isinstance(error, ConfigError) else ExitCode.FAILED
+    complain(f"mapstream has a mistake of its own: {type(error).__name__}: {error}")
+    complain(f"{_TRACEBACK}=1 shows where; please report it with what you did")
+    return ExitCode.FAILED
 
 
 def command_line(words: Sequence[str]) -> typer.Typer:

@@ -5,7 +5,8 @@ from __future__ import annotations
 import json
 import math
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import fields, is_dataclass
 from enum import IntEnum
 from pathlib import Path
@@ -70,6 +71,16 @@ def say_table(columns: Sequence[str], rows: Sequence[Sequence[object]]) -> None:
     for row in rows:
         table.add_row(*(escape(_cell(cell)) for cell in row))
     _out.print(table, soft_wrap=False)
+
+
+@contextmanager
+def fraction_bar(what: str) -> Iterator[Callable[[float], None]]:
+    """Show a bar on a terminal; yields what takes the fraction that is done."""
+    from rich.progress import Progress  # noqa: PLC0415  # not for every verb
+
+    with Progress(console=_err, transient=True, disable=not sys.stderr.isatty()) as progress:
+        task = progress.add_task(what, total=1.0)
+        yield lambda fraction: progress.update(task, completed=fraction)
 
 
 def plain(value: object) -> Any:  # noqa: ANN401  # of a JSON document

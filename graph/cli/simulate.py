@@ -7,13 +7,12 @@ from typing import Annotated
 
 import typer
 from pydantic import BaseModel
-from rich.progress import track
 
 from mapstream.graph.cli.options import KeySetList, config_from
-from mapstream.graph.cli.output import JsonFlag, in_place, say, say_json
+from mapstream.graph.cli.output import JsonFlag, fraction_bar, in_place, say, say_json
 from mapstream.graph.problems import did_you_mean
-from mapstream.recordings.mcap_writer import McapWriter
-from mapstream.recordings.worlds.catalogue import WORLDS, World
+from mapstream.recordings.worlds import catalogue
+from mapstream.recordings.worlds.catalogue import WORLDS
 from mapstream.streams.errors import ConfigError
 
 
@@ -29,19 +28,16 @@ def simulate(
     if world not in WORLDS:
         raise ConfigError(f"no world {world!r}{did_you_mean(world, WORLDS)}")
     config = config_from(WORLDS[world].config_type, set_)
-    count = record_world(WORLDS[world], config, seed, out, has_progress=not json)
+    write_world(world, out, config, seed=seed)
+    num_bytes = out.stat().st_size
     if json:
-        say_json({"path": out, "messages": count, "config": config.model_dump(), "seed": seed})
+        say_json({"path": out, "bytes": num_bytes, "config": config.model_dump(), "seed": seed})
     else:
-        say(f"wrote {in_place(out)}: {count} messages, {out.stat().st_size / 1e6:.1f} MB")
+        say(f"wrote {in_place(out)}: {num_bytes / 1e6:.1f} MB")
 
 
-def record_world(
-    world: World, config: BaseModel, seed: int, out: Path, *, has_progress: bool
-) -> int:
-    """Write a world's recording, and return how many messages it has."""
-    with McapWriter(out) as writer:
-        records = world.records(config, seed)
-        for record in track(records, "simulating", disable=not has_progress, transient=True):
-            writer.write(record.topic, record.message, record.log_ns)
-    return writer.num_messages
+def write_world(world: str, out: Path, config: BaseModel, *, seed: int) -> None:
+    """Write a world's recording, with a bar on a terminal."""
+    options = config.model_dump(exclude_unset=True)
+    with fraction_bar("simulating") as show:
+        catalogue.simulate(world, out, seed=seed, on_progress=show, **options)
