@@ -13,6 +13,10 @@ class ChannelError(MappingError):
     """A message that a channel may not take: sent after the end, or behind the time bound."""
 
 
+class TransformError(MappingError):
+    """A transform that nobody gave; the message has the frames, the stamp, and what is known."""
+
+
 class RecordingError(MappingError):
     """A recording that cannot be read or written; the message has the file, the topic, the offset."""
 
