@@ -1,5 +1,6 @@
 """What flows between operators and what it flows through."""
 
+from mapstream.streams.calibration import CameraCalibration
 from mapstream.streams.channel import Channel, Limits, Receiver, Sender
 from mapstream.streams.clock import Clock, ReplayClock, TestClock, WallClock
 from mapstream.streams.errors import MappingError
@@ -42,6 +43,7 @@ from mapstream.streams.trajectory import Trajectory
 
 __all__ = [
     "SE3",
+    "CameraCalibration",
     "CameraFrame",
     "Channel",
     "Clock",
