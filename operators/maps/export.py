@@ -1,0 +1,158 @@
+"""Maps to files of other tools; the suffix of the file chooses the format."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import get_args, get_type_hints
+
+import numpy as np
+
+from mapstream.operators.maps.aggregate import AggregateConfig, aggregate_cloud
+from mapstream.recordings.cloud_files import write_pcd, write_ply
+from mapstream.recordings.g2o import write_g2o
+from mapstream.recordings.maps.model import Map
+from mapstream.recordings.mcap_writer import McapWriter
+from mapstream.recordings.trajectory_files import write_euroc, write_kitti, write_tum
+from mapstream.streams.errors import MapError
+from mapstream.streams.geometry import SE3
+from mapstream.streams.messages.estimates import Odometry, RelativePose
+from mapstream.streams.messages.sensors import IntArray
+from mapstream.streams.trajectory import Trajectory
+
+_RELATIVE_KINDS = get_args(get_type_hints(RelativePose)["kind"])
+
+
+class ExportConfig(AggregateConfig):
+    """What is exported; the voxels are those of clouds."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ExportReport:
+    """What was written, and what the format has no place for."""
+
+    files: tuple[Path, ...]
+    written: dict[str, int] = field(default_factory=dict)  # poses, edges, points
+    left_out: dict[str, int] = field(default_factory=dict)  # edges by kind
+
+
+def export_map(map_: Map, folder: Path, path: Path, config: ExportConfig) -> ExportReport:
+    """Write a map as `.tum`, `.kitti`, `.csv` (EuRoC), `.g2o`, `.ply`, `.pcd` or `.mcap`, in the map frame.
+
+    Args:
+        map_: The map.
+        folder: Where it lies, for its clouds.
+        path: The file; of several missions, trajectories get a file each, with the mission in its name.
+        config: See there.
+
+    Raises:
+        MapError: If the suffix is of no known format, or the map has nothing to write there.
+        RecordingError: If the file cannot be written.
+    """
+    export = EXPORTERS.get(path.suffix.lower())
+    if export is None:
+        raise MapError(f"{path}: unknown format {path.suffix!r}; known are {', '.join(EXPORTERS)}")
+    return export(map_, folder, path, config)
+
+
+def _trajectories(map_: Map, path: Path, write: Callable[[Path, Trajectory], None]) -> ExportReport:
+    missions = [m for m in range(len(map_.missions)) if len(map_.vertices_of(m))]
+    if not missions:
+        raise MapError(f"{path}: the map has no poses to write")
+    files = []
+    for mission in missions:
+        name = f"{path.stem}-{map_.mission_id(mission)[:8]}{path.suffix}"
+        files.append(path if len(missions) == 1 else path.with_name(name))
+        rows = map_.vertices_of(mission)
+        stamps_ns = map_.vertices.stamp_ns[rows]
+        write(files[-1], Trajectory(stamps_ns=stamps_ns, poses=map_.T_map_base(rows)))
+    return ExportReport(files=tuple(files), written={"poses": len(map_.vertices)})
+
+
+def _tum(map_: Map, folder: Path, path: Path, config: ExportConfig) -> ExportReport:  # noqa: ARG001
+    return _trajectories(map_, path, write_tum)
+
+
+def _kitti(map_: Map, folder: Path, path: Path, config: ExportConfig) -> ExportReport:  # noqa: ARG001
+    return _trajectories(map_, path, write_kitti)
+
+
+def _euroc(map_: Map, folder: Path, path: Path, config: ExportConfig) -> ExportReport:  # noqa: ARG001
+    return _trajectories(map_, path, write_euroc)
+
+
+def _g2o(map_: Map, folder: Path, path: Path, config: ExportConfig) -> ExportReport:  # noqa: ARG001
+    left_out = write_g2o(map_, path)
+    written = {"poses": len(map_.vertices), "edges": len(map_.edges) - left_out.total()}
+    return ExportReport(files=(path,), written=written, left_out=dict(left_out))
+
+
+def _ply(map_: Map, folder: Path, path: Path, config: ExportConfig) -> ExportReport:
+    cloud = aggregate_cloud(map_, folder, config)
+    write_ply(path, cloud.points, cloud.intensity)
+    return ExportReport(files=(path,), written={"points": len(cloud.points)})
+
+
+def _pcd(map_: Map, folder: Path, path: Path, config: ExportConfig) -> ExportReport:
+    cloud = aggregate_cloud(map_, folder, config)
+    write_pcd(path, cloud.points, cloud.intensity)
+    return ExportReport(files=(path,), written={"points": len(cloud.points)})
+
+
+def _mcap(map_: Map, folder: Path, path: Path, config: ExportConfig) -> ExportReport:  # noqa: ARG001
+    """Write poses as Odometry on `/missions/ID/poses`, relative edges on `/edges`, by stamp."""
+    is_relative = np.isin(map_.edges.kind, _RELATIVE_KINDS) & (map_.edges.vertex_b >= 0)
+    messages = [*_pose_messages(map_), *_edge_messages(map_, np.flatnonzero(is_relative))]
+    messages.sort(key=lambda entry: entry[1].stamp_ns)  # stable: poses first
+    with McapWriter(path) as writer:
+        for topic, message in messages:
+            writer.write(topic, message)
+    written = {"poses": len(map_.vertices), "edges": int(is_relative.sum())}
+    left_out = Counter(map_.edges.kind[~is_relative].tolist())
+    return ExportReport(files=(path,), written=written, left_out=dict(left_out))
+
+
+def _pose_messages(map_: Map) -> list[tuple[str, Odometry | RelativePose]]:
+    poses = map_.T_map_base(np.arange(len(map_.vertices)))
+    topics = [f"/missions/{map_.mission_id(row)}/poses" for row in range(len(map_.missions))]
+    vertices = map_.vertices
+    return [
+        (topics[mission], Odometry(stamp_ns=stamp_ns, T_odom_base=SE3(T)))
+        for mission, stamp_ns, T in zip(
+            vertices.mission.tolist(), vertices.stamp_ns.tolist(), poses, strict=True
+        )
+    ]
+
+
+def _edge_messages(map_: Map, rows: IntArray) -> list[tuple[str, Odometry | RelativePose]]:
+    edges, vertices = map_.edges, map_.vertices
+    ids = [map_.mission_id(row) for row in range(len(map_.missions))]
+    messages: list[tuple[str, Odometry | RelativePose]] = []
+    for row in rows.tolist():
+        a, b = edges.vertex_a[row], edges.vertex_b[row]
+        message = RelativePose(
+            kind=edges.kind[row],
+            mission_a=ids[vertices.mission[a]],
+            stamp_a_ns=int(vertices.stamp_ns[a]),
+            mission_b=ids[vertices.mission[b]],
+            stamp_b_ns=int(vertices.stamp_ns[b]),
+            T_a_b=edges.T_a_b_of(row),
+            covariance=edges.covariance[row],
+            source=edges.source[row],
+            is_switchable=bool(edges.is_switchable[row]),
+        )
+        messages.append(("/edges", message))
+    return messages
+
+
+EXPORTERS: dict[str, Callable[[Map, Path, Path, ExportConfig], ExportReport]] = {
+    ".tum": _tum,
+    ".kitti": _kitti,
+    ".csv": _euroc,
+    ".g2o": _g2o,
+    ".ply": _ply,
+    ".pcd": _pcd,
+    ".mcap": _mcap,
+}

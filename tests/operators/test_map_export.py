@@ -1,0 +1,133 @@
+"""Maps go out in the formats of other tools, and come in."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mapstream.operators.maps.export import EXPORTERS, ExportConfig, export_map
+from mapstream.operators.maps.import_ import ImportConfig, import_map
+from mapstream.recordings.cloud_files import read_pcd, read_ply
+from mapstream.recordings.cloud_store import CloudStore
+from mapstream.recordings.decoding import decoder_for
+from mapstream.recordings.maps import Map, check_map
+from mapstream.recordings.maps.build import add_resources, anchored
+from mapstream.recordings.maps.combine import merge_maps
+from mapstream.recordings.recording import open_recording
+from mapstream.streams.errors import MapError
+from mapstream.streams.geometry import SE3
+from mapstream.streams.messages.estimates import Odometry, PointCloud, RelativePose
+from tests.recordings.made_maps import MISSION, OTHER_MISSION, full_map, line_map
+
+CONFIG = ExportConfig(voxel_size_m=0.5)
+
+
+def placed_map() -> Map:
+    """A map whose mission frame is not the map frame."""
+    return anchored(full_map(), 0, SE3.exp([0.1, 0.2, 0.3, 10.0, 20.0, 30.0]))
+
+
+def map_with_clouds(folder: Path) -> Map:
+    points = np.random.default_rng(0).uniform(-5, 5, (300, 3)).astype(np.float32)
+    with CloudStore(folder / "clouds") as store:
+        store.put("c", PointCloud(stamp_ns=0, points=points, intensity=points[:, 2]))
+    return add_resources(
+        placed_map(), vertex_rows=np.array([0]), kind="cloud", paths=["clouds/c.arrow"]
+    )
+
+
+@pytest.mark.parametrize("suffix", [".tum", ".csv"])
+def test_M12_a_trajectory_comes_back_exactly(suffix: str, tmp_path: Path) -> None:
+    map_ = placed_map()
+    path = tmp_path / f"drive{suffix}"
+
+    report = export_map(map_, tmp_path, path, CONFIG)
+    again = import_map(path, ImportConfig())
+
+    assert report.files == (path,)
+    assert report.written == {"poses": 6}
+    np.testing.assert_array_equal(again.vertices.stamp_ns, map_.vertices.stamp_ns)
+    poses = map_.T_map_base(np.arange(6))
+    np.testing.assert_allclose(again.vertices.T_mission_base, poses, atol=1e-9)
+    assert check_map(again) == []
+    assert again.edges.kind.tolist() == ["odometry"] * 5
+
+
+def test_S3_kitti_poses_are_those_of_the_map_frame(tmp_path: Path) -> None:
+    map_ = placed_map()
+
+    export_map(map_, tmp_path, tmp_path / "drive.kitti", CONFIG)
+
+    again = import_map(tmp_path / "drive.kitti", ImportConfig())
+    poses = map_.T_map_base(np.arange(6))
+    np.testing.assert_allclose(again.vertices.T_mission_base, poses, atol=1e-9)
+
+
+def test_each_mission_gets_a_trajectory_of_its_own(tmp_path: Path) -> None:
+    merged = merge_maps([full_map(), line_map(4, OTHER_MISSION)])
+
+    report = export_map(merged, tmp_path, tmp_path / "all.tum", CONFIG)
+
+    assert [file.name for file in report.files] == [
+        f"all-{mission[:8]}.tum" for mission in (MISSION, OTHER_MISSION)
+    ]
+    assert len(import_map(report.files[1], ImportConfig()).vertices) == 4
+
+
+def test_S3_a_pose_graph_says_what_it_leaves_out(tmp_path: Path) -> None:
+    report = export_map(placed_map(), tmp_path, tmp_path / "drive.g2o", CONFIG)
+
+    assert report.written == {"poses": 6, "edges": 5}
+    assert report.left_out == {"imu": 5}
+    assert len(import_map(tmp_path / "drive.g2o", ImportConfig()).edges) == 5
+
+
+def test_O2_S3_clouds_are_written_in_the_map_frame(tmp_path: Path) -> None:
+    map_ = map_with_clouds(tmp_path)
+
+    ply = export_map(map_, tmp_path, tmp_path / "map.ply", CONFIG)
+    pcd = export_map(map_, tmp_path, tmp_path / "map.pcd", CONFIG)
+
+    assert ply.written == pcd.written
+    T_map_base = map_.T_map_base(np.array([0]))[0]
+    for cloud in (read_ply(tmp_path / "map.ply"), read_pcd(tmp_path / "map.pcd")):
+        assert len(cloud.points) == ply.written["points"]
+        assert cloud.intensity is not None
+        np.testing.assert_allclose(cloud.points.mean(axis=0), T_map_base[:3, 3], atol=0.7)
+
+
+def test_S6_poses_and_edges_go_into_a_recording(tmp_path: Path) -> None:
+    map_ = placed_map()
+
+    report = export_map(map_, tmp_path, tmp_path / "drive.mcap", CONFIG)
+
+    assert report.written == {"poses": 6, "edges": 5}
+    assert report.left_out == {"imu": 5}
+    with open_recording(tmp_path / "drive.mcap") as recording:
+        decoders = {name: decoder_for(topic.channel) for name, topic in recording.topics.items()}
+        messages = [decoders[raw.topic](raw) for raw in recording.messages()]
+    poses = [m for m in messages if isinstance(m, Odometry)]
+    edges = [m for m in messages if isinstance(m, RelativePose)]
+    np.testing.assert_allclose(
+        [pose.T_odom_base.matrix for pose in poses], map_.T_map_base(np.arange(6)), atol=1e-12
+    )
+    np.testing.assert_array_equal([pose.stamp_ns for pose in poses], map_.vertices.stamp_ns)
+    np.testing.assert_allclose([edge.T_a_b.matrix for edge in edges], map_.edges.T_a_b[:5])
+
+
+def test_unknown_formats_are_refused(tmp_path: Path) -> None:
+    known = r"known are \.tum, \.kitti, \.csv, \.g2o, \.ply, \.pcd, \.mcap"
+    with pytest.raises(MapError, match=rf"map\.las: unknown format '\.las'; {known}"):
+        export_map(full_map(), tmp_path, tmp_path / "map.las", CONFIG)
+    with pytest.raises(MapError, match=r"unknown format '\.bag'; known are \.tum, \.kitti"):
+        import_map(tmp_path / "drive.bag", ImportConfig())
+
+
+@pytest.mark.parametrize("suffix", [s for s in EXPORTERS if s not in (".g2o", ".mcap")])
+def test_an_empty_map_has_nothing_to_write(suffix: str, tmp_path: Path) -> None:
+    with pytest.raises(MapError, match=r"no poses to write|there are no clouds"):
+        export_map(Map.empty(), tmp_path, tmp_path / f"map{suffix}", CONFIG)
+
+    assert not list(tmp_path.iterdir())
