@@ -5,7 +5,6 @@ from __future__ import annotations
 import fcntl
 import os
 from pathlib import Path
-from types import TracebackType
 from typing import Self
 
 from mapstream.streams.errors import MapError
@@ -45,12 +44,7 @@ class FolderLock:
         os.pwrite(self._file, str(os.getpid()).encode(), 0)
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         os.close(
             self._file
         )  # gives the lock back; the file stays, or two runs could lock two files

@@ -50,24 +50,28 @@ def select(tables: Mapping[str, Table], keep: Mapping[str, BoolArray]) -> dict[s
     Args:
         tables: By name, each after those that it refers to.
         keep: Masks by table; a table without one keeps every row that may stay.
+
+    Raises:
+        ValueError: If there is no such table, or a mask is not as long as its table.
     """
+    for name, mask in keep.items():
+        if name not in tables or len(mask) != len(tables[name]):
+            lengths = {each: len(table) for each, table in tables.items()}
+            raise ValueError(f"a mask of {len(mask)} rows for {name}; the tables have {lengths}")
     selected: dict[str, Table] = {}
     new_rows: dict[str, IntArray] = {}  # by table: the new number of each row, -1 where dropped
     for name, table in tables.items():
         stays = np.array(keep.get(name, np.ones(len(table), dtype=bool)), dtype=bool)
-        references = references_of(type(table))
         renumbered: dict[str, IntArray] = {}
-        for column in references:
+        for column in references_of(type(table)):
             rows = getattr(table, column.name)
             renumbered[column.name] = np.where(
                 rows < 0, rows, np.append(new_rows[str(column.refers_to)], -1)[rows]
             )
             stays &= (renumbered[column.name] >= 0) | (rows < 0)
         new_rows[name] = np.where(stays, np.cumsum(stays) - 1, -1)
-        if stays.all():  # nothing before it moved either, or the references say where
-            selected[name] = replace(table, **renumbered) if renumbered else table
-        else:
-            selected[name] = take(replace(table, **renumbered), stays)
+        moved = replace(table, **renumbered) if renumbered else table
+        selected[name] = moved if stays.all() else take(moved, stays)  # whole columns are shared
     return selected
 
 

@@ -10,6 +10,7 @@ import hashlib
 import json
 import re
 from collections.abc import Iterable
+from contextlib import suppress
 from pathlib import Path
 
 from pydantic import BaseModel, ConfigDict, NonNegativeInt, ValidationError
@@ -99,10 +100,10 @@ def _files_in_use(folder: Path) -> list[str]:
 
 def _remove_all_but(folder: Path, files: Iterable[str]) -> None:
     keep = {folder / file for file in files}
-    for path in (folder / TABLES_FOLDER).iterdir():
-        is_ours = path.name.endswith((".arrow", TEMPORARY))
-        if is_ours and path not in keep:
-            path.unlink(missing_ok=True)
+    for path in (folder / TABLES_FOLDER).glob("*"):
+        if path.name.endswith((".arrow", TEMPORARY)) and path not in keep:
+            with suppress(OSError):  # what stays does no harm, and the next save tries again
+                path.unlink()
 
 
 def read_manifest(path: Path | str) -> Manifest:

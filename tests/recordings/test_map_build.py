@@ -170,3 +170,10 @@ def test_wrong_columns_are_refused() -> None:
         replace(line_map(2).edges, kind=np.array([7], dtype=object))
     with pytest.raises(ValueError, match="Vertices: the column mission is missing"):
         type(vertices)(id=vertices.id)
+
+
+def test_masks_for_no_table_are_refused() -> None:
+    with pytest.raises(ValueError, match="a mask of 3 rows for vertexes; the tables have"):
+        line_map(3).select(vertexes=np.ones(3, dtype=bool))
+    with pytest.raises(ValueError, match="a mask of 2 rows for vertices"):
+        line_map(3).select(vertices=np.ones(2, dtype=bool))

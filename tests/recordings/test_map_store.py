@@ -277,3 +277,10 @@ def test_a_table_made_to_deceive_never_breaks_the_process(name: str, tmp_path: P
         edit_manifest(tmp_path, tables=tables | {name: changed})
         with suppress(MapFormatError):
             load_map(tmp_path, tables=[name])
+
+
+def test_a_path_that_can_be_no_folder_is_named(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+
+    with pytest.raises(MapError, match=f"{tmp_path}/file: cannot be used as a map folder"):
+        save_map(line_map(2), tmp_path / "file")
