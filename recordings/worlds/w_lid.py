@@ -19,15 +19,14 @@ from mapstream.recordings.worlds.sensors import (
     imu_batches,
 )
 from mapstream.recordings.worlds.simulation import Record, Simulation
-from mapstream.streams.geometry import SE3
+from mapstream.streams.geometry import SE3, so3_exp
 from mapstream.streams.messages.estimates import Odometry
 from mapstream.streams.messages.sensors import FloatArray
 
 START_NS = 1_700_000_000 * 10**9
-T_BASE_LIDAR = SE3.exp(
-    [0.0, 0.05, 0.0, 0.2, 0.0, 1.1]
-)  # pitched, so that a forgotten extrinsic shows
-T_BASE_IMU = SE3.exp([0.0, 0.0, 0.0, 0.05, -0.03, 0.2])
+# Turned, so that a forgotten extrinsic shows; level, or point-to-point ICP would climb along the rings.
+T_BASE_LIDAR = SE3.from_rotation(so3_exp([0.0, 0.0, 0.4]), [0.2, 0.0, 1.1])
+T_BASE_IMU = SE3.from_rotation(np.eye(3), [0.05, -0.03, 0.2])
 _KNOT_NS = 50_000_000  # between the points of the motion's spline
 _TRUTH_NS = 10_000_000
 _STAND_S = 1.0
