@@ -13,8 +13,7 @@ import rerun.blueprint as rrb
 
 from mapstream.graph.plan import Plan
 from mapstream.graph.tap_outputs import Output
-from mapstream.graph.views.run import GRAPH
-from mapstream.graph.views.scene import MAP
+from mapstream.graph.views.run import GRAPH, graph_extent
 from mapstream.recordings.maps import Map
 from mapstream.streams.messages import estimates, sensors
 
@@ -44,7 +43,9 @@ _HIDDEN = rrb.EntityBehavior(visible=False)
 
 def blueprint_of(plan: Plan, outputs: Sequence[Output]) -> rrb.Blueprint:
     """Return the layout for the outputs that are drawn."""
-    operators = rrb.GraphView(origin=GRAPH, name="Operators")
+    x_range, y_range = graph_extent(plan)
+    bounds = rrb.VisualBounds2D(x_range=x_range, y_range=y_range)
+    operators = rrb.GraphView(origin=GRAPH, name="Operators", visual_bounds=bounds)
     space = [output for output in outputs if output.sends(*_IN_SPACE)]
     main = rrb.Vertical(map_view(space), operators, row_shares=[3, 1]) if space else operators
     side = [_cameras(plan, outputs), _plots(outputs), _texts(outputs)]
@@ -60,19 +61,14 @@ def blueprint_of(plan: Plan, outputs: Sequence[Output]) -> rrb.Blueprint:
 def map_view(outputs: Sequence[Output]) -> rrb.Spatial3DView:
     """Return the view of all that has a place, seen from the map's frame."""
     has_clouds = any(output.sends(estimates.PointCloud) for output in outputs)
-    has_maps = any(output.sends(Map) for output in outputs)
     hidden = [o.path for o in outputs if o.sends(estimates.Keyframe)]
     hidden += [o.path for o in outputs if has_clouds and o.sends(sensors.LidarScan)]
     hidden += [f"{o.path}/refused" for o in outputs if o.sends(estimates.LoopReport)]
-    hidden += [
-        f"{o.path}/trajectory" for o in outputs if has_maps and o.sends(estimates.MapCorrection)
-    ]
     return rrb.Spatial3DView(
         name="Map",
         origin="/",
-        contents=[f"+ /{output.path}/**" for output in outputs],
+        contents=["+ /map/**", *(f"+ /{output.path}/**" for output in outputs)],
         overrides={f"/{path}": _HIDDEN for path in hidden},
-        spatial_information=rrb.SpatialInformation(target_frame=MAP),
         background=rrb.Background(color=0x0B0E14FF),
         line_grid=rrb.LineGrid3D(visible=True, spacing=10.0, color=0xFFFFFF10),
     )
@@ -124,7 +120,8 @@ def _plots(outputs: Sequence[Output]) -> list[rrb.View]:
 
 def _texts(outputs: Sequence[Output]) -> list[rrb.View]:
     """Return the log, what nobody wrote a view for, and the fixes on the earth."""
-    views: list[rrb.View] = [rrb.TextLogView(name="Log", origin="/")]
+    columns = rrb.TextLogColumns(text_log_columns=["body"])
+    views: list[rrb.View] = [rrb.TextLogView(name="Log", origin="/", columns=columns)]
     views += [
         rrb.MapView(name=output.path, origin=f"/{output.path}")
         for output in outputs

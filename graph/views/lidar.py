@@ -7,7 +7,7 @@ import numpy.typing as npt
 import rerun as rr
 
 from mapstream.graph.views.colors import ColorArray, ramp_colors
-from mapstream.graph.views.scene import BASE, Drawing, Scene, sensor_frame, within
+from mapstream.graph.views.scene import BASE, Drawing, Scene, sensor_frame
 from mapstream.streams.messages.estimates import PointCloud
 from mapstream.streams.messages.sensors import Float32Array, LaserScan2D, LidarScan
 
@@ -21,14 +21,14 @@ def view_lidar_scan(scan: LidarScan, scene: Scene) -> Drawing:
     points, intensity = thinned(scan.points, scan.intensity, scene.settings.max_points)
     colors = _point_colors(points, intensity, scene)
     cloud = rr.Points3D(points, colors=colors, radii=_POINT_SIZE)
-    return [*mount, within("", sensor_frame(scan.frame), cloud)]
+    return [*mount, *scene.within("", sensor_frame(scan.frame), cloud)]
 
 
 def view_point_cloud(cloud: PointCloud, scene: Scene) -> Drawing:
     """Draw the points around the robot, coloured by intensity, else by height."""
     points, intensity = thinned(cloud.points, cloud.intensity, scene.settings.max_points)
     colors = _point_colors(points, intensity, scene)
-    return [within("", BASE, rr.Points3D(points, colors=colors, radii=_POINT_SIZE))]
+    return scene.within("", BASE, rr.Points3D(points, colors=colors, radii=_POINT_SIZE))
 
 
 def view_laser_scan(scan: LaserScan2D, scene: Scene) -> Drawing:
@@ -39,7 +39,7 @@ def view_laser_scan(scan: LaserScan2D, scene: Scene) -> Drawing:
     angles = scan.angle_min_rad + np.flatnonzero(is_hit) * scan.angle_step_rad
     ends = ranges[is_hit, None] * np.stack([np.cos(angles), np.sin(angles), 0 * angles], axis=-1)
     beams = rr.Points3D(ends.astype(np.float32), colors=0xFFD54FFF, radii=_BEAM_SIZE)
-    return [*mount, within("", sensor_frame(scan.frame), beams)]
+    return [*mount, *scene.within("", sensor_frame(scan.frame), beams)]
 
 
 def thinned(

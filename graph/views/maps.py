@@ -1,34 +1,39 @@
-"""A map as it is stored: missions, loops by their switch, landmarks, clouds."""
+"""A map as it is stored: missions, loops by their switch, other edges, landmarks."""
 
 from __future__ import annotations
 
 import numpy as np
 import rerun as rr
 
-from mapstream.graph.views.colors import mission_color, ramp_colors, switch_colors
-from mapstream.graph.views.scene import MAP, Columns, Drawing, Entry, Scene, within
+from mapstream.graph.views.colors import ramp_colors, switch_colors
+from mapstream.graph.views.growing import LINE, MAP_PATH, redraw_loops, redraw_mission
+from mapstream.graph.views.scene import Columns, Drawing, Entry, Scene, Vertex
 from mapstream.recordings.maps import Map
 
-_LINE = rr.Radius.ui_points(2.5)
-_QUIET = ("odometry", "imu")  # kinds whose edges follow the trajectory
+_QUIET = ("odometry", "imu", "loop")  # along the trajectory, or drawn with the live loops
 
 
 def view_map(map_: Map, scene: Scene) -> Drawing:
-    """Draw each mission's trajectory, the edges beside it, and landmarks by kind."""
+    """Draw each mission's trajectory, loops by switch value, other edges and landmarks by kind."""
     drawing: list[Entry | Columns] = []
     for row in range(len(map_.missions)):
-        mission_id = map_.mission_id(row)
         vertices = map_.vertices_of(row)
-        positions = map_.T_map_base(vertices)[:, :3, 3]
-        color = mission_color(scene.mission_number(mission_id))
-        line = rr.LineStrips3D([positions], colors=color, radii=_LINE)
-        if len(positions):
-            drawing.append(within(f"missions/{mission_id[:8]}", MAP, line))
-    return [*drawing, *_edges(map_), *_landmarks(map_)]
+        stamps_ns, poses = map_.vertices.stamp_ns[vertices], map_.T_map_base(vertices)
+        drawing += redraw_mission(scene, map_.mission_id(row), stamps_ns, poses)
+    edges = map_.edges
+    for edge in map_.edges_of("loop"):
+        ends = _vertex(map_, edges.vertex_a[edge]), _vertex(map_, edges.vertex_b[edge])
+        scene.loops[ends] = float(edges.switch[edge])
+    return [*drawing, *redraw_loops(scene), *_edges(map_), *_landmarks(map_)]
+
+
+def _vertex(map_: Map, row: np.int64) -> Vertex:
+    vertices = map_.vertices
+    return map_.mission_id(int(vertices.mission[row])), int(vertices.stamp_ns[row])
 
 
 def _edges(map_: Map) -> list[Entry]:
-    """Return the edges between vertices that do not just follow the trajectory, a path per kind."""
+    """Return the edges between vertices that have not been drawn yet, a path per kind."""
     drawing = []
     edges = map_.edges
     for kind in dict.fromkeys(edges.kind):
@@ -37,8 +42,8 @@ def _edges(map_: Map) -> list[Entry]:
             continue
         ends = [map_.T_map_base(v[rows])[:, :3, 3] for v in (edges.vertex_a, edges.vertex_b)]
         lines = np.stack(ends, axis=1).astype(np.float32)
-        strips = rr.LineStrips3D(lines, colors=switch_colors(edges.switch[rows]), radii=_LINE)
-        drawing.append(within(f"edges/{kind}", MAP, strips))
+        strips = rr.LineStrips3D(lines, colors=switch_colors(edges.switch[rows]), radii=LINE)
+        drawing.append(Entry.of(f"{MAP_PATH}/edges/{kind}", strips))
     return drawing
 
 
@@ -54,5 +59,5 @@ def _landmarks(map_: Map) -> list[Entry]:
         low, high = np.percentile(points[:, 2], [2, 98])
         colors = ramp_colors(points[:, 2], float(low), float(high))
         marks = rr.Points3D(points, colors=colors, radii=rr.Radius.ui_points(2))
-        drawing.append(within(f"landmarks/{kind}", MAP, marks))
+        drawing.append(Entry.of(f"{MAP_PATH}/landmarks/{kind}", marks))
     return drawing

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import islice
+
 import numpy as np
 import rerun as rr
 
@@ -14,7 +16,7 @@ from mapstream.graph.views.scene import (
     Entry,
     Scene,
     placed,
-    within,
+    transform,
 )
 from mapstream.streams.geometry import SE3
 from mapstream.streams.messages.estimates import Odometry
@@ -26,6 +28,8 @@ from mapstream.streams.messages.sensors import (
     TransformBatch,
     WheelOdometry,
 )
+
+_TRAIL_LENGTH = 100  # positions since the last correction
 
 
 def view_imu_batch(imu: ImuBatch, scene: Scene) -> Drawing:
@@ -69,28 +73,29 @@ def view_transforms(batch: TransformBatch, scene: Scene) -> Drawing:  # noqa: AR
     """Draw the transform tree as it was published; its frames do not meet ours."""
     newest = {child: row for row, child in enumerate(batch.children)}
     for child, row in newest.items():
-        T = SE3(batch.T_parent_child[row])
-        transform = rr.Transform3D(
-            translation=T.t,
-            quaternion=rr.Quaternion(xyzw=T.quat_xyzw),
-            parent_frame=f"tf:{batch.parents[row]}",
-            child_frame=f"tf:{child}",
-        )
-        yield Entry.of(child, transform, is_static=batch.is_static)
+        T_parent_child = SE3(batch.T_parent_child[row])
+        parent = f"tf:{batch.parents[row]}"
+        moved = transform(T_parent_child, parent_frame=parent, child_frame=f"tf:{child}")
+        yield Entry.of(rr.escape_entity_path_part(child), moved, is_static=batch.is_static)
 
 
 def _motion(stamp_ns: int, T_odom_base: SE3, scene: Scene) -> list[Entry | Columns]:
-    drawing: list[Entry | Columns] = []
-    if scene.is_main():
-        scene.driven[stamp_ns] = T_odom_base.t
-        drawing.append(placed(BASE, ODOM, T_odom_base))
-        if scene.once("robot"):
-            body = rr.Boxes3D(half_sizes=[0.5, 0.3, 0.2], colors=ROBOT, fill_mode="solid")
-            frame = rr.CoordinateFrame(BASE)
-            drawing.append(Entry.of("robot", frame, body, rr.TransformAxes3D(2.0), is_static=True))
-    path, points = scene.trail("trail", T_odom_base.t)
-    line = rr.LineStrips3D([points], colors=DRIVEN, radii=rr.Radius.ui_points(1.5))
-    return [*drawing, within(path, ODOM, line)]
+    """Return where odometry alone would have gone, and if it moves the robot, the robot."""
+    path, points = scene.line("uncorrected", T_odom_base.t)
+    line = rr.LineStrips3D([points], colors=DRIVEN, radii=rr.Radius.ui_points(1.0))
+    drawing: list[Entry | Columns] = [Entry.of(path, line)]
+    if not scene.is_main():
+        return drawing
+    drawing.append(placed(BASE, ODOM, T_odom_base))
+    scene.driven[stamp_ns] = T_odom_base.t
+    newest = list(islice(reversed(scene.driven.values()), _TRAIL_LENGTH))
+    trail = rr.LineStrips3D([newest], colors=ROBOT, radii=rr.Radius.ui_points(1.5))
+    drawing += scene.within("trail", ODOM, trail)
+    if scene.once("robot"):
+        body = rr.Boxes3D(half_sizes=[0.5, 0.3, 0.2], colors=ROBOT, fill_mode="solid")
+        frame = rr.CoordinateFrame(BASE)
+        drawing.append(Entry.of("robot", frame, body, is_static=True))
+    return drawing
 
 
 def _plot(path: str, stamps_ns: IntArray, values: FloatArray) -> Columns:

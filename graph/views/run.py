@@ -30,6 +30,12 @@ def operator_graph(plan: Plan) -> list[Entry]:
     return [Entry.of(GRAPH, nodes, edges, is_static=True), Entry.of(GRAPH, labels)]
 
 
+def graph_extent(plan: Plan) -> tuple[tuple[float, float], tuple[float, float]]:
+    """Return the ranges of x and y that hold the drawing, labels included."""
+    x, y = zip(*_places(plan).values(), strict=True)
+    return (min(x) - _COLUMN / 2, max(x) + _COLUMN / 2), (min(y) - _ROW / 2, max(y) + _ROW / 2)
+
+
 def view_snapshot(snapshot: Snapshot, scene: Scene) -> Drawing:
     """Plot rates, queues and load, and write them into the operator graph."""
     previous: dict[str, tuple[float, int]] = scene.remember("previous", {})

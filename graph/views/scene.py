@@ -1,9 +1,9 @@
 """What one message adds to the picture, and what the picture remembers between messages.
 
 A view returns entries whose paths are relative to the output that sent the message: `odometry/odometry`.
-A path with a leading slash is absolute. Entities lie in named coordinate frames, so that a view need not
-know where the robot is: `map` holds `odom` (moved by corrections), `odom` holds `base` (moved by
-odometry), `base` holds the sensors, and `map` holds one frame per submap.
+A path with a leading slash is absolute. What lies in the map needs no frame. What moves lies in a named
+frame, so that a view need not know where the robot is: the map holds `odom` (moved by corrections),
+`odom` holds `base` (moved by odometry), and `base` holds the sensors.
 """
 
 from __future__ import annotations
@@ -20,9 +20,13 @@ from mapstream.streams.geometry import SE3
 from mapstream.streams.messages.sensors import FloatArray, IntArray
 
 Vertex = tuple[str, int]  # mission, stamp
-MAP, ODOM, BASE = "map", "odom", "base"
+MAP, ODOM, BASE = (
+    "tf#/",
+    "odom",
+    "base",
+)  # the first is Rerun's name for the frame of plain entities
 FRAMES = "/frames"  # the entities that hold the transforms between frames
-_STRETCH = 100  # positions of a trail that one message logs at most
+_STRETCH = 100  # positions of a line that one message logs at most
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,8 +59,8 @@ View = Callable[[Any, "Scene"], Drawing]
 class ViewSettings:
     """How much detail is worth its bytes, and which output moves the robot."""
 
-    max_points: int = 30_000  # of one scan or cloud
-    max_submap_points: int = 20_000
+    max_points: int = 15_000  # of one scan or cloud
+    max_submap_points: int = 10_000
     jpeg_above_bytes: int = 100_000  # raw images larger than this are compressed
     jpeg_quality: int = 80
     main_odometry: str | None = None  # path of the output that moves `base`; None: the first
@@ -73,10 +77,10 @@ class Scene:
     missions: list[str] = field(default_factory=list)  # in the order of their appearance
     driven: dict[int, FloatArray] = field(default_factory=dict)  # stamp -> position in odom
     corrected: dict[str, tuple[IntArray, FloatArray]] = field(default_factory=dict)  # in map
-    submaps: dict[str, tuple[str, int, SE3]] = field(default_factory=dict)  # frame -> what moves it
-    loops: dict[str, list[tuple[Vertex, Vertex]]] = field(default_factory=dict)  # by output
+    submaps: dict[str, tuple[Vertex, SE3]] = field(default_factory=dict)  # by path: what moves it
+    loops: dict[tuple[Vertex, Vertex], float] = field(default_factory=dict)  # ends -> switch
     _known: dict[tuple[str, str], Any] = field(default_factory=dict)
-    _trails: dict[tuple[str, str], tuple[int, list[FloatArray]]] = field(default_factory=dict)
+    _lines: dict[tuple[str, str], tuple[int, list[FloatArray]]] = field(default_factory=dict)
 
     def remember(self, key: str, value: Any) -> Any:  # noqa: ANN401  # views keep what they like
         """Return what this output remembered under the key first: this value, or an earlier one."""
@@ -86,6 +90,14 @@ class Scene:
         """Return True at the first call for this output and key: for styles, which are static."""
         token = object()
         return self.remember(key, token) is token
+
+    def within(self, path: str, frame: str, *archetypes: object) -> list[Entry]:
+        """Return the entries of an entity whose coordinates are those of a named frame."""
+        entry = Entry.of(path, *archetypes)
+        if not self.once(f"frame of {path}"):
+            return [entry]
+        # Static, or the viewer would complain at times before the first message.
+        return [Entry.of(path, rr.CoordinateFrame(frame), is_static=True), entry]
 
     def mount(self, frame: str, T_base_sensor: SE3) -> list[Entry]:
         """Return the entry that places a sensor on the robot, if it is new or was moved."""
@@ -108,27 +120,27 @@ class Scene:
             self.missions.append(mission_id)
         return self.missions.index(mission_id)
 
-    def trail(self, name: str, position: FloatArray) -> tuple[str, FloatArray]:
+    def line(self, name: str, position: FloatArray) -> tuple[str, FloatArray]:
         """Add a position (3,) to a line; return the path and the points (N, 3) of its last stretch.
 
         Stretches are short, so that a long line is not logged whole with each message.
         """
         slot = (self.path, name)
-        number, points = self._trails.get(slot, (0, []))
+        number, points = self._lines.get(slot, (0, []))
         if len(points) >= _STRETCH:
             number, points = number + 1, points[-1:]
         points = [*points, position]
-        self._trails[slot] = number, points
+        self._lines[slot] = number, points
         return f"{name}/{number}", np.array(points)
 
     def start_epoch(self) -> list[Entry]:
-        """Forget where the robot was; return the entries that wipe the trails of this output."""
-        trails = [slot for slot in self._trails if slot[0] == self.path]
-        for slot in trails:
-            del self._trails[slot]
+        """Forget where the robot was; return the entries that wipe the lines of this output."""
+        lines = [slot for slot in self._lines if slot[0] == self.path]
+        for slot in lines:
+            del self._lines[slot]
         if self.main_odometry == self.path:
             self.driven.clear()
-        return [Entry.of(name, rr.Clear(recursive=True)) for _, name in trails]
+        return [Entry.of(name, rr.Clear(recursive=True)) for _, name in lines]
 
     def places(self, stamps_ns: npt.ArrayLike, mission_id: str | None = None) -> FloatArray | None:
         """Return positions (N, 3) in the map at stamps (N,), as good as they are known now.
@@ -159,17 +171,20 @@ def sensor_frame(frame: str) -> str:
     return f"sensor:{frame}"
 
 
+def transform(
+    T_parent_child: SE3, parent_frame: str | None = None, child_frame: str | None = None
+) -> rr.Transform3D:
+    """Return Rerun's form of a transform, of an entity or between named frames."""
+    quaternion = rr.Quaternion(xyzw=T_parent_child.quat_xyzw)
+    return rr.Transform3D(
+        translation=T_parent_child.t,
+        quaternion=quaternion,
+        parent_frame=parent_frame,
+        child_frame=child_frame,
+    )
+
+
 def placed(child: str, parent: str, T_parent_child: SE3) -> Entry:
     """Return the entry that says where a frame lies in its parent."""
-    transform = rr.Transform3D(
-        translation=T_parent_child.t,
-        quaternion=rr.Quaternion(xyzw=T_parent_child.quat_xyzw),
-        parent_frame=parent,
-        child_frame=child,
-    )
-    return Entry.of(f"{FRAMES}/{rr.escape_entity_path_part(child)}", transform)
-
-
-def within(path: str, frame: str, *archetypes: object) -> Entry:
-    """Return an entry whose coordinates are those of a named frame."""
-    return Entry.of(path, rr.CoordinateFrame(frame), *archetypes)
+    moved = transform(T_parent_child, parent_frame=parent, child_frame=child)
+    return Entry.of(f"{FRAMES}/{rr.escape_entity_path_part(child)}", moved)

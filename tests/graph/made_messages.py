@@ -35,7 +35,7 @@ from mapstream.streams.messages.sensors import (
 MISSION = "ab" * 16
 STEP_NS = 100_000_000
 _RNG = np.random.default_rng(7)
-_POINTS = _RNG.normal(size=(50, 3)).astype(np.float32)
+_POINTS = (_RNG.normal(size=(50, 3)) * (5, 5, 0.1)).astype(np.float32)  # open ground
 _IMAGE = np.arange(48 * 64, dtype=np.uint8).reshape(48, 64)
 
 

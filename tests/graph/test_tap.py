@@ -73,10 +73,10 @@ async def test_P2_a_run_is_drawn_into_a_file(tmp_path: Path) -> None:
     assert len(values_of(entities["/drive/scans"], "Points3D:positions")) == 12
     assert len(values_of(entities["/frames/base"], "Transform3D:translation")) == 12
     assert len(values_of(entities["/drive/clouds"], "Points3D:positions")) == 12
-    submaps = {name.split("/")[4] for name in entities if name.startswith("/drive/submaps/")}
+    submaps = {name.split("/")[4] for name in entities if name.startswith("/map/submaps/")}
     assert submaps == {"0", "1", "2"}
-    assert "LineStrips3D:strips" in columns_of(entities["/drive/loops/accepted"])
-    assert f"/drive/maps/missions/{made.MISSION[:8]}" in entities
+    assert "LineStrips3D:strips" in columns_of(entities["/map/edges/loop"])
+    assert f"/map/trajectory/{made.MISSION[:8]}" in entities
     assert {"GraphNodes:node_ids", "GraphEdges:edges"} <= columns_of(entities["/run/graph"])
     assert columns_of(entities["/drive/scans"]) >= {"stamp", "seq"}
 

@@ -15,6 +15,7 @@ import rerun as rr
 from mapstream.graph import views
 from mapstream.graph.tap_sinks import SinkSpec
 from mapstream.graph.views import Entry, Scene, ViewSettings, view_of
+from mapstream.graph.views.ceiling import without_ceiling
 from mapstream.graph.views.colors import ACCEPTED, REFUSED, switch_colors
 from mapstream.graph.views.lidar import thinned
 from mapstream.streams.geometry import SE3
@@ -106,7 +107,7 @@ def test_P1_odometry_moves_the_robot_and_leaves_a_trail(tmp_path: Path) -> None:
     places = values_of(entities["/frames/base"], "Transform3D:translation")
     np.testing.assert_allclose(places[-1][0], made.pose(4).t, atol=1e-5)
     assert values_of(entities["/frames/base"], "Transform3D:parent_frame")[0] == ["odom"]
-    trail = values_of(entities["/op/port/trail/0"], "LineStrips3D:strips")
+    trail = values_of(entities["/op/port/trail"], "LineStrips3D:strips")
     assert len(trail[-1][0]) == 5
 
 
@@ -114,7 +115,7 @@ def test_a_long_trail_is_drawn_in_stretches(tmp_path: Path) -> None:
     """With a message only its last stretch is logged, so that a run's file grows with its length."""
     entities = drawn(tmp_path, [made.odometry(step) for step in range(250)])
 
-    stretches = {name for name in entities if "/trail/" in name}
+    stretches = {name for name in entities if "/uncorrected/" in name}
     assert len(stretches) == 3
 
 
@@ -123,18 +124,18 @@ def test_a_second_odometry_does_not_move_the_robot() -> None:
 
     paths = [entry.path for entry in view_of(made.odometry(0))(made.odometry(0), scene)]
 
-    assert set(paths) == {"trail/0", "speed"}
+    assert set(paths) == {"uncorrected/0", "speed"}
 
 
 def test_P1_submaps_are_drawn_in_their_own_frame(tmp_path: Path) -> None:
     entities = drawn(tmp_path, [made.submap(0), made.submap(1)])
 
-    path = f"/op/port/{made.MISSION[:8]}"
+    path = f"/map/submaps/{made.MISSION[:8]}"
     assert len(values_of(entities[f"{path}/0/cloud"], "Points3D:positions")[0]) == 4 * 50
     assert len(values_of(entities[f"{path}/1/cloud"], "Points3D:positions")[0]) == 3 * 50
     assert len(values_of(entities[f"{path}/0/edges"], "LineStrips3D:strips")[0]) == 3
-    (frame,) = values_of(entities[f"{path}/0/cloud"], "CoordinateFrame:frame")[0]
-    assert frame == f"submap:{made.MISSION[:8]}:0"
+    (place,) = values_of(entities[f"{path}/1"], "Transform3D:translation")
+    np.testing.assert_allclose(place[0], made.pose(3).t, atol=1e-5)
 
 
 def test_a_correction_moves_odometry_and_only_the_submaps_that_moved() -> None:
@@ -146,10 +147,10 @@ def test_a_correction_moves_odometry_and_only_the_submaps_that_moved() -> None:
     moved_by_none = [e.path for e in view_of(same)(same, scene)]
     moved = [e.path for e in view_of(shifted)(shifted, scene)]
 
-    frame = f"/frames/submap\\:{made.MISSION[:8]}\\:0"
+    submap = f"/map/submaps/{made.MISSION[:8]}/0"
     assert "/frames/odom" in moved_by_none
-    assert frame not in moved_by_none
-    assert frame in moved
+    assert submap not in moved_by_none
+    assert submap in moved
     np.testing.assert_allclose(scene.T_map_odom.t, [0, 2, 0])
 
 
@@ -158,7 +159,7 @@ def test_P1_loops_are_drawn_by_verdict_and_said_why(tmp_path: Path) -> None:
 
     entities = drawn(tmp_path, messages)
 
-    assert len(values_of(entities["/op/port/accepted"], "LineStrips3D:strips")[-1]) == 1
+    assert len(values_of(entities["/map/edges/loop"], "LineStrips3D:strips")[-1]) == 1
     assert len(values_of(entities["/op/port/refused"], "LineStrips3D:strips")[-1]) == 1
     texts = [row[0] for row in values_of(entities["/op/port/log"], "TextLog:text")]
     assert texts[0].startswith("accepted")
@@ -173,16 +174,16 @@ def test_accepted_loops_follow_a_correction() -> None:
     shifted = made.correction(shift_m=2.0)
     entries = {e.path: e for e in view_of(shifted)(shifted, scene) if isinstance(e, Entry)}
 
-    strips = entries["/op/port/accepted"].archetypes[1].strips.as_arrow_array().to_pylist()
+    strips = entries["/map/edges/loop"].archetypes[0].strips.as_arrow_array().to_pylist()
     np.testing.assert_allclose(strips[0][0], made.pose(0).t + np.array([0, 2, 0]), atol=1e-5)
 
 
 def test_P1_a_map_is_drawn_with_its_loops_coloured_by_switch(tmp_path: Path) -> None:
     entities = drawn(tmp_path, [made.made_map()])
 
-    mission = entities[f"/op/port/missions/{made.MISSION[:8]}"]
+    mission = entities[f"/map/trajectory/{made.MISSION[:8]}"]
     assert len(values_of(mission, "LineStrips3D:strips")[0][0]) == 4
-    assert values_of(entities["/op/port/edges/loop"], "LineStrips3D:colors") == [[ACCEPTED]]
+    assert values_of(entities["/map/edges/loop"], "LineStrips3D:colors") == [[ACCEPTED]]
 
 
 def test_P1_switch_values_go_from_red_to_green() -> None:
@@ -246,6 +247,19 @@ def test_thinning_keeps_at_most_the_limit(count: int) -> None:
     assert len(points) <= 100
     assert intensity is not None
     assert len(intensity) == len(points) >= min(count, 50)
+
+
+def test_a_ceiling_is_left_out_and_the_walls_stay() -> None:
+    x, y = np.random.default_rng(1).uniform(-5, 5, (2, 1000))
+    floor, ceiling = np.stack([x, y, 0 * x - 1], 1), np.stack([x, y, 0 * x + 2], 1)
+    wall = np.stack([x, 0 * x + 5, y / 5 + 0.5], 1)
+    path = np.zeros((1, 3))
+
+    inside = without_ceiling(np.concatenate([floor, wall, ceiling]).astype(np.float32), path)
+    outside = without_ceiling(np.concatenate([floor, wall]).astype(np.float32), path)
+
+    assert len(inside) == len(outside) == 2000
+    assert inside[:, 2].max() < 2
 
 
 def test_a_sensor_is_placed_again_only_when_it_moved() -> None:

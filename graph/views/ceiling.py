@@ -1,0 +1,34 @@
+"""Indoors a map is a closed box: without its lid one sees where the robot drove."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from mapstream.streams.messages.sensors import Float32Array, FloatArray
+
+_REACH_M = 1.5  # what lies above this far around the path is overhead
+_HEADROOM_M = 0.4  # above the base
+_SHARE = 0.01  # of the points: less overhead is a tree, a wire, a bridge
+_SLACK_M = 0.3  # ceilings are rough
+
+
+def without_ceiling(points: Float32Array, path: FloatArray) -> Float32Array:
+    """Return the points below the ceiling, all points where there is none over the path.
+
+    Args:
+        points: Shape (N, 3) [m], z up.
+        path: Positions of the base (K, 3), in the same frame.
+    """
+    if not len(points):
+        return points
+    nearest = np.full(len(points), np.inf)
+    height = np.zeros(len(points))
+    for place in path:
+        distance = np.hypot(*(points[:, :2] - place[:2]).T)
+        is_nearer = distance < nearest
+        nearest[is_nearer] = distance[is_nearer]
+        height[is_nearer] = (points[:, 2] - place[2])[is_nearer]
+    overhead = height[(nearest < _REACH_M) & (height > _HEADROOM_M)]
+    if len(overhead) < _SHARE * len(points):
+        return points
+    return points[height < np.median(overhead) - _SLACK_M]
