@@ -38,6 +38,7 @@ _KNOWN = (
     sensors.TransformBatch,
     estimates.ImageFeatures,
 )
+_CLOSED = (rrb.BlueprintPanel(state="collapsed"), rrb.SelectionPanel(state="collapsed"))
 _HIDDEN = rrb.EntityBehavior(visible=False)
 
 
@@ -53,9 +54,13 @@ def blueprint_of(plan: Plan, outputs: Sequence[Output]) -> rrb.Blueprint:
     return rrb.Blueprint(
         rrb.Horizontal(main, rrb.Vertical(*shown), column_shares=[5, 2]),
         rrb.TimePanel(timeline="stamp", state="collapsed"),
-        rrb.BlueprintPanel(state="collapsed"),
-        rrb.SelectionPanel(state="collapsed"),
+        *_CLOSED,
     )
+
+
+def map_blueprint() -> rrb.Blueprint:
+    """Return the layout for a stored map."""
+    return rrb.Blueprint(map_view([]), rrb.TimePanel(timeline="stamp", state="hidden"), *_CLOSED)
 
 
 def map_view(outputs: Sequence[Output]) -> rrb.Spatial3DView:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from mapstream.streams.messages.sensors import Float32Array, FloatArray
 
@@ -21,14 +22,10 @@ def without_ceiling(points: Float32Array, path: FloatArray) -> Float32Array:
     """
     if not len(points):
         return points
-    nearest = np.full(len(points), np.inf)
-    height = np.zeros(len(points))
-    for place in path:
-        distance = np.hypot(*(points[:, :2] - place[:2]).T)
-        is_nearer = distance < nearest
-        nearest[is_nearer] = distance[is_nearer]
-        height[is_nearer] = (points[:, 2] - place[2])[is_nearer]
-    overhead = height[(nearest < _REACH_M) & (height > _HEADROOM_M)]
+    distance, row = cKDTree(path[:, :2]).query(points[:, :2])
+    height = points[:, 2] - path[row, 2]
+    overhead = height[(distance < _REACH_M) & (height > _HEADROOM_M)]
     if len(overhead) < _SHARE * len(points):
         return points
-    return points[height < np.median(overhead) - _SLACK_M]
+    below: Float32Array = points[height < np.median(overhead) - _SLACK_M]
+    return below

@@ -5,11 +5,15 @@ from __future__ import annotations
 import numpy as np
 import rerun as rr
 
+from mapstream.graph.views.ceiling import without_ceiling
 from mapstream.graph.views.colors import ramp_colors, switch_colors
 from mapstream.graph.views.growing import LINE, MAP_PATH, redraw_loops, redraw_mission
+from mapstream.graph.views.lidar import height_colors
 from mapstream.graph.views.scene import Columns, Drawing, Entry, Scene, Vertex
 from mapstream.recordings.maps import Map
+from mapstream.streams.messages.estimates import PointCloud
 
+_CLOUD_SIZE = rr.Radius.ui_points(1.2)
 _QUIET = ("odometry", "imu", "loop")  # along the trajectory, or drawn with the live loops
 
 
@@ -25,6 +29,14 @@ def view_map(map_: Map, scene: Scene) -> Drawing:
         ends = _vertex(map_, edges.vertex_a[edge]), _vertex(map_, edges.vertex_b[edge])
         scene.loops[ends] = float(edges.switch[edge])
     return [*drawing, *redraw_loops(scene), *_edges(map_), *_landmarks(map_)]
+
+
+def cloud_entry(map_: Map, cloud: PointCloud, scene: Scene) -> Entry:
+    """Draw the cloud of a whole map, in its frame, coloured by height, without a ceiling."""
+    path = map_.T_map_base(np.arange(len(map_.vertices)))[:, :3, 3]
+    points = without_ceiling(cloud.points, path)
+    colors = height_colors(points[:, 2], scene)
+    return Entry.of(f"{MAP_PATH}/cloud", rr.Points3D(points, colors=colors, radii=_CLOUD_SIZE))
 
 
 def _vertex(map_: Map, row: np.int64) -> Vertex:

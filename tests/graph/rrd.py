@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import socket
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -41,3 +42,10 @@ def strict() -> Iterator[None]:
         yield
     finally:
         rr.set_strict_mode(False)
+
+
+def unused_url() -> str:
+    """Return a url of this machine at which nothing listens."""
+    with socket.socket() as listener:
+        listener.bind(("127.0.0.1", 0))
+        return f"rerun+http://127.0.0.1:{listener.getsockname()[1]}/proxy"

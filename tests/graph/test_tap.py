@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import socket
 import time
 from collections import Counter
 from collections.abc import Iterable
@@ -22,7 +21,7 @@ from mapstream.graph.tap_sinks import DEFAULT_URL, SinkSpec
 from mapstream.streams.errors import ConfigError
 from tests.graph import made_messages as made
 from tests.graph.picture_stages import drive_plan
-from tests.graph.rrd import columns_of, read_rrd, strict, values_of
+from tests.graph.rrd import columns_of, read_rrd, strict, unused_url, values_of
 
 pytestmark = pytest.mark.anyio
 
@@ -49,12 +48,6 @@ class SlowSink:
 
     def close(self) -> None:
         self.may_go_on.wait()
-
-
-def unused_port() -> int:
-    with socket.socket() as listener:
-        listener.bind(("127.0.0.1", 0))
-        return int(listener.getsockname()[1])
 
 
 def with_rerun(plan: Plan, **rules: list[str]) -> Plan:
@@ -147,8 +140,7 @@ def test_a_live_run_never_waits_even_for_a_file(tmp_path: Path) -> None:
 
 async def test_without_a_viewer_a_run_ends_soon_and_says_so() -> None:
     plan = drive_plan()
-    url = f"rerun+http://127.0.0.1:{unused_port()}/proxy"
-    with RerunTap(plan, SinkSpec.parse(f"connect={url}").open()) as tap:
+    with RerunTap(plan, SinkSpec.parse(f"connect={unused_url()}").open()) as tap:
         await run_graph(plan, taps=[tap])
 
     assert any("no viewer answered" in note for note in tap.notes())

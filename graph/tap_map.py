@@ -1,0 +1,54 @@
+"""A stored map in Rerun: where each mission went, which loops hold, and the cloud of all keyframes."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+
+from mapstream.graph.tap_sinks import Sink
+from mapstream.operators.maps.aggregate import AggregateConfig, aggregate_cloud
+from mapstream.recordings.maps import Map
+from mapstream.streams.errors import MapError
+
+_PATH = "map"
+_VOXEL_SIZE_M = 0.2  # a voxel of the cloud is a pixel or less where one sees a whole map
+_FLUSH_S = 60.0
+
+
+def view_map(
+    map_: Map, folder: Path | None, sink: Sink, *, voxel_size_m: float = _VOXEL_SIZE_M
+) -> list[str]:
+    """Draw a map, and return what is missing from the picture.
+
+    Args:
+        map_: The map.
+        folder: Its folder, with the clouds of its keyframes; None: without clouds.
+        sink: Where it is drawn.
+        voxel_size_m: One point of the cloud is drawn per voxel.
+
+    Raises:
+        MapError: If no viewer answers, or the one that did takes nothing.
+    """
+    from mapstream.graph.blueprint import map_blueprint  # noqa: PLC0415  # imports rerun
+    from mapstream.graph.views import Scene, view_of  # noqa: PLC0415
+    from mapstream.graph.views.maps import cloud_entry  # noqa: PLC0415
+
+    notes = []
+    scene = Scene(path=_PATH)
+    drawing = [*view_of(map_)(map_, scene)]
+    if folder is not None:
+        try:
+            config = AggregateConfig(voxel_size_m=voxel_size_m, with_unanchored=True)
+            drawing.append(cloud_entry(map_, aggregate_cloud(map_, folder, config), scene))
+        except MapError as error:  # a map without clouds still has trajectories
+            notes.append(f"rerun: the map is drawn without clouds: {error}")
+    end_s = time.monotonic() + sink.patience_s
+    while not sink.try_open(map_blueprint()):
+        if time.monotonic() > end_s:
+            raise MapError("rerun: no viewer answered; start one with `rerun`, or try save=FILE")
+        time.sleep(0.2)
+    sink.draw(_PATH, drawing, stamp_ns=map_.stamp_ns, sequence=0)
+    if not sink.flush(_FLUSH_S):
+        raise MapError(f"rerun: the viewer did not take the map within {_FLUSH_S:.0f} s")
+    sink.close()
+    return notes
