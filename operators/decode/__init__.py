@@ -1,0 +1,1 @@
+"""From compressed to raw."""

@@ -1,0 +1,184 @@
+"""A recording as the source of a graph: MCAP, ROS 1 bag or rosbag2."""
+
+from __future__ import annotations
+
+from typing import Any, Protocol, runtime_checkable
+
+import anyio.to_thread
+
+from mapstream.operators.operator import (
+    Activity,
+    DynamicPorts,
+    NoPorts,
+    Operator,
+    Ports,
+    context,
+    offload,
+)
+from mapstream.operators.sources.extrinsics import Extrinsics
+from mapstream.operators.sources.mcap_config import McapSourceConfig
+from mapstream.operators.sources.playback import Playback
+from mapstream.operators.sources.stamps import StampWatch
+from mapstream.operators.sources.topic_reader import Played, Reading, TopicReader
+from mapstream.recordings.decoding import decoder_for
+from mapstream.recordings.recording import Recording, check_topics, open_recording
+from mapstream.streams.errors import DecodeError
+
+_ADVANCE_NS = 10_000_000  # of log time between two updates of all bounds
+
+
+@runtime_checkable
+class _Seekable(Protocol):
+    """A clock that can ask to play from somewhere else."""
+
+    @property
+    def section(self) -> tuple[int, int] | None: ...
+
+    def take_seek(self) -> int | None: ...
+
+
+class McapSource(DynamicPorts, Operator[NoPorts, Ports]):
+    """Play a recording in log-time order, paced by the clock.
+
+    Every message leaves with its stamp, its frame, and where it lies in the recording. Damaged parts
+    and messages that cannot be decoded are counted as losses, odd stamps as warnings. A seek, or a
+    sensor's clock that jumps, starts a new epoch.
+    """
+
+    placement = "thread"
+
+    def __init__(self, config: McapSourceConfig) -> None:
+        self.config = config
+        self._readers: dict[str, TopicReader] = {}
+        self._extrinsics: Extrinsics | None = None
+        self._num_losses = 0
+        self._advanced_ns: int | None = None
+
+    @classmethod
+    def ports_for(cls, config: McapSourceConfig) -> tuple[dict[str, Any], dict[str, Any]]:
+        return {}, {port: config.message_type(port) for port in config.topics}
+
+    async def run(self, inputs: NoPorts, outputs: Ports) -> None:  # noqa: ARG002
+        config = self.config
+        with await anyio.to_thread.run_sync(open_recording, config.path) as recording:
+            start_ns = recording.start_ns + round(config.start_s * 1e9)
+            end_ns = recording.end_ns + 1
+            if config.end_s is not None:
+                end_ns = min(end_ns, recording.start_ns + round(config.end_s * 1e9))
+            context().activity.span_ns = (start_ns, end_ns)
+            self._extrinsics = await anyio.to_thread.run_sync(
+                Extrinsics, recording, config.transforms, config.base_frame
+            )
+            self._readers = self._make_readers(recording, self._extrinsics)
+            playback = Playback(recording, list(self._readers.values()), end_ns)
+            playback.start(start_ns)
+            try:
+                await self._play(playback, recording, outputs)
+            finally:
+                playback.close()
+                self._report(context().activity, recording)
+
+    def _make_readers(self, recording: Recording, extrinsics: Extrinsics) -> dict[str, TopicReader]:
+        """Make a reader for each port.
+
+        Raises:
+            RecordingError: If the recording lacks a topic.
+            DecodeError: If a topic cannot be decoded, or not to the type of its port.
+        """
+        config = self.config
+        wanted = {port: config.topic(port) for port in config.topics}
+        check_topics(config.path, [topic.topic for topic in wanted.values()], recording.topics)
+        readers = {}
+        for port, topic in wanted.items():
+            channel = recording.topics[topic.topic].channel
+            message_type = config.message_type(port)
+            try:
+                decoder = decoder_for(channel, None if message_type is Any else message_type)
+            except DecodeError as error:
+                raise DecodeError(
+                    f"{config.path}: port {port}: {error}{_hint(str(error))}"
+                ) from error
+            reading = Reading(
+                port=port,
+                path=str(config.path),
+                offset_ns=round(topic.offset_s * 1e9),
+                stamp=topic.stamp,
+                batch_ns=round(config.imu_batch_s * 1e9),
+                origin_ns=recording.start_ns,
+                stops_on_error=config.on_error == "stop",
+                place=extrinsics.place,
+            )
+            watch = StampWatch(topic.topic, max_jump_ns=round(config.max_jump_s * 1e9))
+            readers[port] = TopicReader(reading, decoder, watch)
+        return readers
+
+    async def _play(self, playback: Playback, recording: Recording, outputs: Ports) -> None:
+        """Send batch after batch, from where a seek says if there is one."""
+        clock, activity = context().clock, context().activity
+        seekable = clock if isinstance(clock, _Seekable) else None
+        is_over = False
+        while not is_over:
+            batch = await offload(playback.next_batch)
+            self._report(activity, recording)
+            target_ns = None
+            for played in batch:
+                await clock.sleep_until(played.log_ns)
+                target_ns = seekable.take_seek() if seekable else None
+                if target_ns is not None:
+                    break
+                activity.position_ns = played.log_ns
+                await self._send(played, outputs)
+            is_over = not batch
+            if is_over and seekable and seekable.section:  # a section that loops ends here
+                await clock.sleep_until(seekable.section[1] + 1)
+                target_ns = seekable.take_seek()
+            if target_ns is not None:
+                _start_epoch(outputs)
+                playback.start(target_ns)
+                is_over = False
+
+    async def _send(self, played: Played, outputs: Ports) -> None:
+        if played.starts_epoch:
+            _start_epoch(outputs)
+            self._advanced_ns = None
+        await outputs[played.port].send(played.message)
+        self._advance(played.log_ns, outputs)
+
+    def _advance(self, log_ns: int, outputs: Ports) -> None:
+        """Promise on every port what its messages' lag so far and the configured lateness allow."""
+        if self._advanced_ns is not None and log_ns - self._advanced_ns < _ADVANCE_NS:
+            return
+        self._advanced_ns = log_ns
+        lags = [r.watch.least_offset_ns for r in self._readers.values() if r.watch.has_seen]
+        if not lags:
+            return
+        lateness_ns = round(self.config.lateness_s * 1e9)
+        for port, reader in self._readers.items():
+            lag_ns = reader.watch.least_offset_ns if reader.watch.has_seen else min(lags)
+            outputs[port].advance(log_ns + lag_ns - lateness_ns - reader.reading.batch_ns)
+
+    def _report(self, activity: Activity, recording: Recording) -> None:
+        """Bring the counts of warnings and losses up to date."""
+        for loss in recording.losses[self._num_losses :]:
+            text = f"{recording.path} at byte {loss.offset}: {loss.reason}"
+            if loss.num_messages == 0:
+                activity.warnings[text] = 1
+            else:
+                activity.losses[f"{text} ({loss.num_messages or 'unknown'} messages)"] = 1
+        self._num_losses = len(recording.losses)
+        if self._extrinsics is not None:
+            activity.warnings.update(self._extrinsics.notices)
+        for reader in self._readers.values():
+            activity.warnings.update(reader.notices)
+            activity.losses.update({f"{reader.topic}: {t}": n for t, n in reader.losses.items()})
+
+
+def _start_epoch(outputs: Ports) -> None:
+    for sender in outputs.values():
+        sender.start_epoch()
+
+
+def _hint(error: str) -> str:
+    if "EncodedImage" in error and "CameraFrame" in error:
+        return "; read it as `images`, and add the operator image_decode"
+    return ""

@@ -1,0 +1,97 @@
+"""What a graph file says of a recording that it plays."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, Literal
+
+from pydantic import Field, NonNegativeFloat, PositiveFloat, field_validator
+
+from mapstream.operators.operator import OperatorConfig
+from mapstream.recordings.message_codec import known_messages
+from mapstream.streams.messages.estimates import Odometry, PointCloud
+from mapstream.streams.messages.sensors import (
+    CameraFrame,
+    EncodedImage,
+    GnssFix,
+    ImuBatch,
+    LaserScan2D,
+    LidarScan,
+    TransformBatch,
+    WheelOdometry,
+)
+
+_TYPES: dict[str, type[Any]] = {  # by the name of a port
+    "scans": LidarScan,
+    "imu": ImuBatch,
+    "frames": CameraFrame,
+    "images": EncodedImage,
+    "odometry": Odometry,
+    "wheels": WheelOdometry,
+    "fixes": GnssFix,
+    "laser": LaserScan2D,
+    "clouds": PointCloud,
+    "transforms": TransformBatch,
+}
+
+
+class TopicConfig(OperatorConfig):
+    topic: str
+    type: str | None = Field(
+        default=None, description="the message, where the port's name does not say: LidarScan, ..."
+    )
+    offset_s: float = Field(default=0.0, description="added to all stamps: a fixed delay")
+    stamp: Literal["header", "log"] = Field(default="header", description="which time is the stamp")
+
+    @field_validator("type")
+    @classmethod
+    def _check_type(cls, name: str | None) -> str | None:
+        known = known_messages()
+        if name is not None and name not in known:
+            raise ValueError(f"no message {name!r}; known: {', '.join(sorted(known))}")
+        return name
+
+
+class McapSourceConfig(OperatorConfig):
+    path: Path = Field(description="an .mcap, .bag or .db3 file, or a rosbag2 folder")
+    topics: dict[str, str | TopicConfig] = Field(
+        description="port: topic, or port: {topic, type, offset_s, stamp}"
+    )
+    base_frame: str = Field(default="base_link", description="the robot's frame on `transforms`")
+    transforms: tuple[str, ...] = Field(
+        default=("/tf", "/tf_static"),
+        description="topics that say where sensors sit, if they exist",
+    )
+    start_s: NonNegativeFloat = Field(default=0.0, description="where to begin, after the start")
+    end_s: PositiveFloat | None = Field(default=None, description="where to stop, after the start")
+    imu_batch_s: PositiveFloat = Field(
+        default=0.05, description="IMU samples of this much log time make one message"
+    )
+    lateness_s: NonNegativeFloat = Field(
+        default=0.2, description="how much more than usual a message may lag behind its log time"
+    )
+    max_jump_s: PositiveFloat = Field(
+        default=5.0, description="a clock that jumps farther starts a new epoch"
+    )
+    on_error: Literal["skip", "stop"] = Field(
+        default="skip", description="what to do with messages that cannot be decoded"
+    )
+
+    @field_validator("topics")
+    @classmethod
+    def _check_topics(cls, topics: dict[str, str | TopicConfig]) -> dict[str, str | TopicConfig]:
+        if not topics:
+            raise ValueError("no topics; give at least one, such as {scans: /points}")
+        return topics
+
+    def topic(self, port: str) -> TopicConfig:
+        """Return what a port reads, in full."""
+        entry = self.topics[port]
+        return TopicConfig(topic=entry) if isinstance(entry, str) else entry
+
+    def message_type(self, port: str) -> Any:  # noqa: ANN401  # Any where nothing says it
+        """Return the type of a port: as given, or by its name (`scans`, `scans_front`)."""
+        given = self.topic(port).type
+        if given is not None:
+            return known_messages()[given]
+        return next((t for name, t in _TYPES.items() if f"{port}_".startswith(f"{name}_")), Any)
