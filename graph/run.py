@@ -17,6 +17,7 @@ from mapstream.graph.links import Link, edges_with_epochs
 from mapstream.graph.metrics import Meter, Snapshot
 from mapstream.graph.observed import ObservedSender, Tap, Taps
 from mapstream.graph.plan import Node, Plan
+from mapstream.graph.remote import RemoteStage
 from mapstream.graph.report import RunReport, report_of
 from mapstream.graph.spec import OnErrorSpec
 from mapstream.graph.stage import Ends, Stage
@@ -86,9 +87,11 @@ class _Run:
         spans_epochs = node.signature.operator_type.spans_epochs
         inputs = [link for link in self._links if link.edge.to_node == node.name]
         marked = [] if spans_epochs else [i.edge for i in inputs if i.edge in self._marked]
-        receivers = {i.edge.to_port: Receiver(i.channel, spans_epochs=spans_epochs) for i in inputs}
+        reads_on = spans_epochs or node.placement == "process"  # there the process sees the epochs
+        receivers = {i.edge.to_port: Receiver(i.channel, spans_epochs=reads_on) for i in inputs}
         senders = {port: self._sender(node.name, port) for port in node.signature.outputs}
-        return Stage(
+        kind = RemoteStage if node.placement == "process" else Stage
+        return kind(
             node,
             Ends(
                 receivers=receivers,

@@ -157,12 +157,7 @@ class Stage:
             cause = cause.exceptions[0]
         if isinstance(cause, OperatorError):
             return cause
-        stamps = {
-            port: receiver.last_stamp_ns
-            for port, receiver in self.ends.receivers.items()
-            if receiver.last_stamp_ns is not None
-        }
-        after = ", ".join(f"{port} at stamp_ns {stamp}" for port, stamp in stamps.items())
+        after = ", ".join(f"{port} at stamp_ns {t}" for port, t in self.last_stamps().items())
         place = f"{self.node.position}: " if self.node.position else ""
         what = str(cause) if isinstance(cause, MappingError) else f"{type(cause).__name__}: {cause}"
         error = OperatorError(
@@ -171,6 +166,11 @@ class Stage:
         )
         error.__cause__ = cause
         return error
+
+    def last_stamps(self) -> dict[str, int]:
+        """Return the stamp of the message that was taken last from each input."""
+        stamps = {port: r.last_stamp_ns for port, r in self.ends.receivers.items()}
+        return {port: stamp for port, stamp in stamps.items() if stamp is not None}
 
 
 def _fill(ports_type: type[Any], names: Mapping[str, object], ends: Mapping[str, object]) -> Any:  # noqa: ANN401

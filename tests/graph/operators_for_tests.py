@@ -88,6 +88,7 @@ class StepConfig(OperatorConfig):
     fail_at: int = -1  # raise at the block with this value
     kill_at: int = -1  # end the process with the signal
     signal: int = signal.SIGKILL
+    sleep_at: int = -1  # wait for a signal, for good
     gate: str = ""  # wait for this gate before each block
     log: str = ""
 
@@ -114,6 +115,8 @@ class Step(Operator[BlocksIn, BlocksOut]):
             raise ValueError(f"no {block.value} please")
         if block.value == config.kill_at:
             os.kill(os.getpid(), config.signal)
+        if block.value == config.sleep_at:
+            signal.pause()
         data = block.data * config.factor
         return Block(stamp_ns=block.stamp_ns, value=block.value * config.factor, data=data)
 
