@@ -114,8 +114,8 @@ class LiveMap:
         return make_factors(self.map.edges, rows, self._noise_of)
 
     def _take_poses(self) -> None:
-        frames = self.map.missions.T_map_mission[self.map.vertices.mission]
-        poses = invert(frames) @ self._problem.poses()
+        T_mission_map = invert(self.map.missions.T_map_mission)
+        poses = T_mission_map[self.map.vertices.mission] @ self._problem.poses()
         self.map = replace(self.map, vertices=replace(self.map.vertices, T_mission_base=poses))
 
     def _settle_contradiction(self) -> None:
