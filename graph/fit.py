@@ -12,7 +12,7 @@ from mapstream.graph.document import Positions
 from mapstream.graph.plan import Plan
 from mapstream.graph.problems import GraphError, Problem, did_you_mean
 from mapstream.graph.wiring import accepts, type_name
-from mapstream.recordings.decoding import decoder_for, message_type_of
+from mapstream.recordings.decoding import decoder_for
 from mapstream.recordings.recording import Recording, Topic
 from mapstream.streams.errors import DecodeError
 from mapstream.streams.messages.sensors import LidarScan
@@ -41,8 +41,9 @@ def readings_of(plan: Plan, recording: Path) -> list[Reading]:
 
 
 def _expected(plan: Plan, node: str, port: str) -> Any:  # noqa: ANN401  # a message type
+    declared = plan.nodes[node].signature.outputs[port].message_type
     types = [e.message_type for e in plan.edges if (e.from_node, e.from_port) == (node, port)]
-    return next((t for t in types if t is not Any), Any)
+    return next((t for t in [declared, *types] if t is not Any), Any)
 
 
 def topics_for(expected: Any, recording: Recording) -> list[Topic]:  # noqa: ANN401  # a message type
@@ -52,8 +53,15 @@ def topics_for(expected: Any, recording: Recording) -> list[Topic]:  # noqa: ANN
 
 
 def _reads_as(topic: Topic, expected: Any) -> bool:  # noqa: ANN401  # a message type
-    kind = message_type_of(topic.channel)
-    return kind is not None and accepts(expected, kind)
+    """Return whether a topic decodes to a type, by itself or on request."""
+    wanted = expected if isinstance(expected, type) else None
+    for kind in (None, wanted):
+        try:
+            if accepts(expected, decoder_for(topic.channel, kind).message_type):
+                return True
+        except DecodeError:
+            continue
+    return False
 
 
 def check_fit(plan: Plan, positions: Positions, recording: Recording) -> list[str]:
@@ -86,18 +94,14 @@ def _mismatch(reading: Reading, recording: Recording) -> str | None:
         there = [t.name for t in topics_for(reading.expected, recording)]
         hint = did_you_mean(reading.topic, there or recording.topics)
         return f"{recording.path} has no topic {reading.topic!r}{hint}"
-    expected = None if reading.expected is Any else reading.expected
     try:
         kind = decoder_for(topic.channel).message_type
     except DecodeError as error:
         return str(error)
-    if not accepts(reading.expected, kind):
-        try:
-            decoder_for(topic.channel, expected)
-        except DecodeError:
-            wanted = type_name(reading.expected)
-            return f"{topic.name} is {topic.schema_name}, read as {type_name(kind)}, not {wanted}"
-    return None
+    if _reads_as(topic, reading.expected):
+        return None
+    wanted = type_name(reading.expected)
+    return f"{topic.name} is {topic.schema_name}, read as {type_name(kind)}, not {wanted}"
 
 
 def _describe(reading: Reading, recording: Recording) -> Iterator[str]:

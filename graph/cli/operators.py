@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import re
 from typing import Annotated, Any
 
 import typer
@@ -97,8 +98,9 @@ def describe(catalogue: Catalogue, name: str) -> dict[str, Any]:
 
 
 def _annotation(annotation: object) -> str:
+    """Return a type without modules and limits: `float`, `tuple[str, ...]`."""
     name = annotation.__name__ if isinstance(annotation, type) else str(annotation)
-    return name.replace("typing.", "").replace("pathlib.", "")
+    return re.sub(r"Annotated\[([^,\[\]]+), [^\[\]]*\]", r"\1", re.sub(r"\w+\.(?=\w)", "", name))
 
 
 def _shown(default: object) -> str:

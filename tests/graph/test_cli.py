@@ -205,7 +205,7 @@ class TestMap:
     def test_check_of_a_good_map(self, mapstream: Terminal, folder: Path) -> None:
         done = mapstream("map", folder, "check")
 
-        assert (done.code, done.out) == (0, f"{folder}: no violations\n")
+        assert (done.code, done.out) == (0, "map: no violations\n")
 
     def test_check_of_a_bad_map(self, mapstream: Terminal, folder: Path) -> None:
         (table,) = (folder / "tables").glob("edges-*")
@@ -219,8 +219,8 @@ class TestMap:
     def test_stats(self, mapstream: Terminal, folder: Path) -> None:
         found = mapstream("map", folder, "stats", "--json").json
 
-        assert found["rows"]["vertices"] == 2
-        assert found["edges"] == [{"kind": "odometry", "count": 1, "switched_off": 0}]
+        assert found["num_rows"]["vertices"] == 2
+        assert [(edge["kind"], edge["count"]) for edge in found["edges"]] == [("odometry", 1)]
 
     def test_info_of_a_map(self, mapstream: Terminal, folder: Path) -> None:
         assert "1 missions" in mapstream("info", folder).out
