@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from mapstream.streams.geometry import hat
 from mapstream.streams.messages.sensors import FloatArray
 
 _NOISE_FLOOR_M = 0.01  # of a range; simulated surfaces fit better than any real one
@@ -35,8 +36,16 @@ def covariance_of_planes(points: FloatArray, normals: FloatArray, rmse_m: float)
     scale = np.array([1 / reach_m] * 3 + [1.0] * 3)  # rotations as metres at the mean range
     jacobian = np.hstack([np.cross(points, normals), normals]) * scale
     variance = _CORRELATION * max(rmse_m if np.isfinite(rmse_m) else 0.0, _NOISE_FLOOR_M) ** 2
-    squares, axes = np.linalg.eigh(jacobian.T @ jacobian)
-    information = (squares - len(points) * _NORMAL_ERROR_RAD**2) / variance
+    seen = jacobian.T @ jacobian - _seen_by_noise(points) * np.outer(scale, scale)
+    information, axes = np.linalg.eigh(seen / variance)
     variances = 1 / np.maximum(information, 1 / _MAX_SIGMA_M**2)
     covariance: FloatArray = (axes * variances) @ axes.T * np.outer(scale, scale)
     return (covariance + covariance.T) / 2
+
+
+def _seen_by_noise(points: FloatArray) -> FloatArray:
+    """Return what normals of no use at all, but with the usual error, would add to the squares (6, 6)."""
+    lever = hat(points.sum(axis=0))
+    rotation = np.sum(points**2) * np.eye(3) - points.T @ points
+    noise: FloatArray = np.block([[rotation, lever], [lever.T, len(points) * np.eye(3)]])
+    return _NORMAL_ERROR_RAD**2 * noise

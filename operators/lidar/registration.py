@@ -93,24 +93,28 @@ class SmallGicp:
     search_distances_m: tuple[float, ...] = (2.0, 0.5)  # of corresponding points, coarse to fine
     inlier_distance_m: float = 0.1  # across the surface
     max_iterations: int = 30
-    _last: tuple[Points, _Prepared] | None = field(default=None, init=False, repr=False)
+    _ready: dict[str, tuple[Points, _Prepared]] = field(
+        default_factory=dict, init=False, repr=False
+    )
 
     def align(self, source: Points, target: Points, T_guess: SE3) -> RegistrationResult:
-        """Align as `Registration.align` says; a target that comes again (the same array) is not prepared again."""
-        prepared_target = self._prepared_target(target)
-        prepared_source = _prepare(source, self.leaf_size_m, "source")
+        """Align as `Registration.align` says; an array that comes again is not prepared again."""
+        ready_target = self._prepared("target", target)
+        ready_source = self._prepared("source", source)
         T, converged = T_guess.matrix, False
         for distance_m in self.search_distances_m:
-            result = self._align_once(prepared_source, prepared_target, T, distance_m)
+            result = self._align_once(ready_source, ready_target, T, distance_m)
             T, converged = result.T_target_source, bool(result.converged)
         raw = SE3(T)  # products of many rotations are no longer quite one
         T_target_source = SE3.from_quat_xyzw(raw.quat_xyzw, raw.t)
-        return self._judge(prepared_source, prepared_target, T_target_source, converged=converged)
+        return self._judge(ready_source, ready_target, T_target_source, converged=converged)
 
-    def _prepared_target(self, target: Points) -> _Prepared:
-        if self._last is None or self._last[0] is not target:
-            self._last = (target, _prepare(target, self.leaf_size_m, "target"))
-        return self._last[1]
+    def _prepared(self, role: str, points: Points) -> _Prepared:
+        known = self._ready.get(role)
+        if known is None or known[0] is not points:
+            known = (points, _prepare(points, self.leaf_size_m, role))
+            self._ready[role] = known
+        return known[1]
 
     def _align_once(
         self,
