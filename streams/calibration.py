@@ -67,3 +67,16 @@ class CameraCalibration:
         K[[0, 1], [0, 1]] = self.focal_px
         K[:2, 2] = self.center_px
         return K
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RangeImageCalibration:
+    """A LiDAR seen as a camera: columns are azimuths, rows are elevations (maplab's camera-3d-lidar)."""
+
+    width_px: int
+    height_px: int
+    horizontal_resolution_rad: float
+    vertical_resolution_rad: float
+    vertical_center_rad: float
+    horizontal_center_rad: float
+    line_delay_ns: int = 0  # between two columns

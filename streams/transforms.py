@@ -7,7 +7,7 @@ before the first and after the last it refuses, since a guess would pass for a m
 from __future__ import annotations
 
 from bisect import bisect_left, bisect_right
-from collections.abc import Callable
+from collections.abc import Callable, Container
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -116,8 +116,8 @@ class TransformTree:
         """
         self._attach(parent, child, _Computed(T_parent_child))
 
-    def add(self, batch: TransformBatch) -> None:
-        """Take all transforms of a message from `/tf` or `/tf_static`.
+    def add(self, batch: TransformBatch, *, except_children: Container[str] = ()) -> None:
+        """Take the transforms of a message from `/tf` or `/tf_static`, but not those of some children.
 
         Raises:
             TransformError: As `add_static` and `add_sample`.
@@ -130,6 +130,8 @@ class TransformTree:
             strict=True,
         )
         for parent, child, stamp_ns, matrix in transforms:
+            if child in except_children:
+                continue
             if batch.is_static:
                 self.add_static(parent, child, SE3(matrix))
             else:
