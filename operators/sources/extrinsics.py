@@ -1,4 +1,4 @@
-"""Where the sensors of a recording sat on the robot, by its transform topics.
+"""Where the sensors of a recording sat on the robot, by a rig's file and by its transform topics.
 
 A sensor that no transform names is itself the base. One whose place is known, but not at the time of a
 message, loses that message: a guess would bend the map.
@@ -18,13 +18,19 @@ from mapstream.streams.transforms import TransformTree
 
 
 class Extrinsics:
-    """Transforms from sensors to the base, static ones read at the start, moving ones when needed."""
+    """Transforms from sensors to the base, static ones read at the start, moving ones when needed.
 
-    def __init__(self, recording: Recording, topics: Sequence[str], base_frame: str) -> None:
+    What the rig's file says of a frame counts, whatever a topic says of it.
+    """
+
+    def __init__(
+        self, recording: Recording, topics: Sequence[str], tree: TransformTree, base_frame: str
+    ) -> None:
         self.notices: Counter[str] = Counter()
         self._recording = recording
         self._base_frame = base_frame
-        self._tree = TransformTree()
+        self._tree = tree
+        self._fixed = frozenset(f for f in self._tree.frames if self._tree.parent_of(f))
         self._cache: dict[str, SE3 | None] = {}  # of frames that do not move
         there = [
             topic
@@ -48,7 +54,7 @@ class Extrinsics:
                 self._moving = []
             if found is None and self._knows(frame):
                 return self._tree.look_up(self._base_frame, frame, stamp_ns)
-            if found is None and self._tree.frames and frame != self._base_frame:
+            if found is None and self._tree.frames:
                 self.notices[
                     f"no transform leads from {frame} to {self._base_frame}: one is the other"
                 ] += 1
@@ -56,6 +62,8 @@ class Extrinsics:
         return self._cache[frame]
 
     def _static_place(self, frame: str) -> SE3 | None:
+        if frame == self._base_frame:
+            return SE3.identity()
         try:  # no sample reaches so far back, so that only static transforms answer
             return self._tree.look_up(self._base_frame, frame, -(2**63))
         except TransformError:
@@ -87,6 +95,8 @@ class Extrinsics:
     def _add(self, batch: TransformBatch) -> None:
         """Add transforms one by one, so that a bad one costs no other."""
         for i, (parent, child) in enumerate(zip(batch.parents, batch.children, strict=True)):
+            if child in self._fixed:
+                continue
             try:
                 T_parent_child = SE3(batch.T_parent_child[i])
                 if batch.is_static:

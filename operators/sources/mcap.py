@@ -20,9 +20,11 @@ from mapstream.operators.sources.mcap_config import McapSourceConfig
 from mapstream.operators.sources.playback import Playback
 from mapstream.operators.sources.stamps import StampWatch
 from mapstream.operators.sources.topic_reader import Played, Reading, TopicReader
-from mapstream.recordings.decoding import decoder_for
+from mapstream.recordings.decoding import Decoder, decoder_for
 from mapstream.recordings.recording import Recording, check_topics, open_recording
 from mapstream.streams.errors import DecodeError
+from mapstream.streams.rig import Rig
+from mapstream.streams.rig_file import load_rig
 
 _ADVANCE_NS = 10_000_000  # of log time between two updates of all bounds
 
@@ -66,10 +68,7 @@ class McapSource(DynamicPorts, Operator[NoPorts, Ports]):
             if config.end_s is not None:
                 end_ns = min(end_ns, recording.start_ns + round(config.end_s * 1e9))
             context().activity.span_ns = (start_ns, end_ns)
-            self._extrinsics = await anyio.to_thread.run_sync(
-                Extrinsics, recording, config.transforms, config.base_frame
-            )
-            self._readers = self._make_readers(recording, self._extrinsics)
+            self._readers = await anyio.to_thread.run_sync(self._make_readers, recording)
             playback = Playback(recording, list(self._readers.values()), end_ns)
             playback.start(start_ns)
             try:
@@ -78,39 +77,52 @@ class McapSource(DynamicPorts, Operator[NoPorts, Ports]):
                 playback.close()
                 self._report(context().activity, recording)
 
-    def _make_readers(self, recording: Recording, extrinsics: Extrinsics) -> dict[str, TopicReader]:
+    def _make_readers(self, recording: Recording) -> dict[str, TopicReader]:
         """Make a reader for each port.
 
         Raises:
+            ConfigError: If the rig's file is wrong.
             RecordingError: If the recording lacks a topic.
             DecodeError: If a topic cannot be decoded, or not to the type of its port.
         """
         config = self.config
         wanted = {port: config.topic(port) for port in config.topics}
         check_topics(config.path, [topic.topic for topic in wanted.values()], recording.topics)
-        readers = {}
-        for port, topic in wanted.items():
-            channel = recording.topics[topic.topic].channel
-            message_type = config.message_type(port)
-            try:
-                decoder = decoder_for(channel, None if message_type is Any else message_type)
-            except DecodeError as error:
-                raise DecodeError(
-                    f"{config.path}: port {port}: {error}{_hint(str(error))}"
-                ) from error
-            reading = Reading(
-                port=port,
-                path=str(config.path),
-                offset_ns=round(topic.offset_s * 1e9),
-                stamp=topic.stamp,
-                batch_ns=round(config.imu_batch_s * 1e9),
-                origin_ns=recording.start_ns,
-                stops_on_error=config.on_error == "stop",
-                place=extrinsics.place,
+        rig = load_rig(config.rig) if config.rig else Rig(base_frame="base_link")
+        base_frame = config.base_frame or rig.base_frame
+        self._extrinsics = Extrinsics(recording, config.transforms, rig.transforms, base_frame)
+        return {
+            port: TopicReader(
+                self._reading(port, recording, rig),
+                self._decoder(port, recording),
+                StampWatch(topic.topic, max_jump_ns=round(config.max_jump_s * 1e9)),
+                self._extrinsics,
             )
-            watch = StampWatch(topic.topic, max_jump_ns=round(config.max_jump_s * 1e9))
-            readers[port] = TopicReader(reading, decoder, watch)
-        return readers
+            for port, topic in wanted.items()
+        }
+
+    def _decoder(self, port: str, recording: Recording) -> Decoder:
+        message_type = self.config.message_type(port)
+        channel = recording.topics[self.config.topic(port).topic].channel
+        try:
+            return decoder_for(channel, None if message_type is Any else message_type)
+        except DecodeError as error:
+            text = f"{self.config.path}: port {port}: {error}{_hint(str(error))}"
+            raise DecodeError(text) from error
+
+    def _reading(self, port: str, recording: Recording, rig: Rig) -> Reading:
+        config, topic = self.config, self.config.topic(port)
+        sensor = rig.sensor_of_topic(topic.topic)
+        return Reading(
+            port=port,
+            path=str(config.path),
+            offset_ns=round(topic.offset_s * 1e9) + (sensor.time_offset_ns if sensor else 0),
+            stamp=topic.stamp,
+            frame=topic.frame or (sensor.node if sensor else ""),
+            batch_ns=round(config.imu_batch_s * 1e9),
+            origin_ns=recording.start_ns,
+            stops_on_error=config.on_error == "stop",
+        )
 
     async def _play(self, playback: Playback, recording: Recording, outputs: Ports) -> None:
         """Send batch after batch, from where a seek says if there is one."""

@@ -42,6 +42,9 @@ class TopicConfig(OperatorConfig):
     )
     offset_s: float = Field(default=0.0, description="added to all stamps: a fixed delay")
     stamp: Literal["header", "log"] = Field(default="header", description="which time is the stamp")
+    frame: str | None = Field(
+        default=None, description="the sensor's frame, if not the recorded one"
+    )
 
     @field_validator("type")
     @classmethod
@@ -55,9 +58,14 @@ class TopicConfig(OperatorConfig):
 class McapSourceConfig(OperatorConfig):
     path: Path = Field(description="an .mcap, .bag or .db3 file, or a rosbag2 folder")
     topics: dict[str, str | TopicConfig] = Field(
-        description="port: topic, or port: {topic, type, offset_s, stamp}"
+        description="port: topic, or port: {topic, type, offset_s, stamp, frame}"
     )
-    base_frame: str = Field(default="base_link", description="the robot's frame on `transforms`")
+    rig: Path | None = Field(
+        default=None, description="a sensor file: places, frames, time offsets"
+    )
+    base_frame: str | None = Field(
+        default=None, description="the robot's frame on `transforms`; the rig's, or base_link"
+    )
     transforms: tuple[str, ...] = Field(
         default=("/tf", "/tf_static"),
         description="topics that say where sensors sit, if they exist",

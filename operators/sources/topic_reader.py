@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 from functools import cache
 from itertools import groupby
@@ -11,11 +10,11 @@ from typing import Any, Literal
 
 import numpy as np
 
+from mapstream.operators.sources.extrinsics import Extrinsics
 from mapstream.operators.sources.stamps import StampWatch
 from mapstream.recordings.decoding import Decoder
 from mapstream.recordings.recording import RawMessage
 from mapstream.streams.errors import DecodeError, TransformError
-from mapstream.streams.geometry import SE3
 from mapstream.streams.messages.sensors import ImuBatch, Message, RecordRef, TransformBatch
 
 
@@ -37,20 +36,23 @@ class Reading:
     path: str
     offset_ns: int = 0  # added to all stamps
     stamp: Literal["header", "log"] = "header"
+    frame: str = ""  # of the sensor, where it is not the recorded one
     batch_ns: int = 0  # IMU samples of this much log time make one message
     origin_ns: int = 0  # where batches begin
     stops_on_error: bool = False
-    place: Callable[[str, int], SE3 | None] | None = None  # T_base_sensor of a frame at a stamp
 
 
 class TopicReader:
     """Decodes one topic, corrects its stamps, gathers IMU samples into batches."""
 
-    def __init__(self, reading: Reading, decoder: Decoder, watch: StampWatch) -> None:
+    def __init__(
+        self, reading: Reading, decoder: Decoder, watch: StampWatch, extrinsics: Extrinsics
+    ) -> None:
         self.reading = reading
         self.watch = watch
         self.losses: Counter[str] = Counter()
         self._decoder = decoder
+        self._extrinsics = extrinsics
         self._samples: list[RawMessage] = []  # of the batch that is growing
         self._batch_end_ns = 0
         self._first_error = ""
@@ -148,23 +150,21 @@ class TopicReader:
 
     def _played(self, message: Message, raw: RawMessage) -> list[Played]:
         """Complete a message; none is left of one whose sensor's place is not known at its time."""
-        reading, topic = self.reading, raw.topic
+        reading, names = self.reading, _names(type(message))
+        shift_ns = self._shift_ns(message, raw)
         changes: dict[str, Any] = {}
-        shift_ns = reading.offset_ns
-        if message.stamp_ns <= 0 or reading.stamp == "log":
-            if reading.stamp != "log":
-                self.watch.notices[f"{topic}: stamps of zero, the log time is used"] += 1
-            shift_ns += raw.log_ns - message.stamp_ns
-        names = _names(type(message))
         if shift_ns and isinstance(message, (ImuBatch, TransformBatch)):
             changes["stamps_ns"] = message.stamps_ns + shift_ns
         elif shift_ns and "stamp_ns" in names:
             changes["stamp_ns"] = message.stamp_ns + shift_ns
         if "record" in names:
-            changes["record"] = RecordRef(path=reading.path, topic=topic, log_ns=raw.log_ns)
-        if reading.place is not None and "T_base_sensor" in names:
+            changes["record"] = RecordRef(path=reading.path, topic=raw.topic, log_ns=raw.log_ns)
+        if reading.frame and "frame" in names:
+            changes["frame"] = reading.frame
+        if "T_base_sensor" in names:
+            frame = reading.frame or getattr(message, "frame", "")
             try:
-                place = reading.place(getattr(message, "frame", ""), message.stamp_ns + shift_ns)
+                place = self._extrinsics.place(frame, message.stamp_ns + shift_ns)
             except TransformError as error:
                 self.losses[f"messages without a place: {str(error).rsplit(':', 1)[0]}"] += 1
                 return []
@@ -174,6 +174,15 @@ class TopicReader:
             message = replace(message, **changes)  # type: ignore[type-var]  # a dataclass by its names
         jumped = self.watch.see(message.stamp_ns, raw.log_ns)
         return [Played(reading.port, message, raw.log_ns, jumped)]
+
+    def _shift_ns(self, message: Message, raw: RawMessage) -> int:
+        """Return what has to be added to the stamps."""
+        reading = self.reading
+        if message.stamp_ns > 0 and reading.stamp == "header":
+            return reading.offset_ns
+        if reading.stamp == "header":
+            self.watch.notices[f"{raw.topic}: stamps of zero, the log time is used"] += 1
+        return reading.offset_ns + raw.log_ns - message.stamp_ns
 
 
 @cache

@@ -10,7 +10,7 @@ from pydantic import ValidationError
 from mapstream.operators.operator import Context, Ports, set_context
 from mapstream.operators.signature import signature_of
 from mapstream.operators.sources.mcap import McapSource
-from mapstream.operators.sources.mcap_config import McapSourceConfig
+from mapstream.operators.sources.mcap_config import McapSourceConfig, TopicConfig
 from mapstream.operators.testing import run_operator
 from mapstream.recordings.decoding import decoder_for
 from mapstream.recordings.mcap_writer import McapWriter
@@ -110,7 +110,7 @@ async def test_batches_do_not_depend_on_where_playing_begins(tmp_path: Path) -> 
 
 async def test_A21_an_offset_moves_all_stamps(tmp_path: Path) -> None:
     path = _record(tmp_path / "a.mcap")
-    topics = {
+    topics: dict[str, Any] = {
         "imu": {"topic": "/imu", "offset_s": 0.02},
         "scans": {"topic": "/points", "stamp": "log", "offset_s": -0.1},
     }
@@ -171,7 +171,8 @@ async def test_A19_extrinsics_come_from_transform_topics(tmp_path: Path) -> None
                 writer.write("/points", _scan(log_ns + 50 * _MS, "pan"), log_ns)
                 writer.write("/fixed", _scan(log_ns, "mast"), log_ns)
                 writer.write("/other", _scan(log_ns, "nowhere"), log_ns)
-        writer.write("/tf_static", transform(_START_NS, "base_link", "mast", mount), log_ns)
+        end_ns = _START_NS + 2000 * _MS
+        writer.write("/tf_static", transform(_START_NS, "base_link", "mast", mount), end_ns)
     run_context = _context()
 
     out = await _run(
@@ -187,6 +188,34 @@ async def test_A19_extrinsics_come_from_transform_topics(tmp_path: Path) -> None
     assert list(run_context.activity.warnings) == [
         "no transform leads from nowhere to base_link: one is the other"
     ]
+
+
+_RIG = """
+sensors:
+  - {id: "00000000000000000000000000000001", sensor_type: IMU, topic: /imu, frame: imu_link}
+  - id: "00000000000000000000000000000002"
+    sensor_type: LIDAR
+    topic: /points
+    frame: top_lidar
+    time_offset_ns: 7000000
+extrinsics:
+  - sensor_id: "00000000000000000000000000000002"
+    base_sensor_id: "00000000000000000000000000000001"
+    T_B_S: [[1, 0, 0, 1], [0, 1, 0, 2], [0, 0, 1, 3], [0, 0, 0, 1]]
+"""
+
+
+async def test_A21_a_sensor_file_gives_places_frames_and_time_offsets(tmp_path: Path) -> None:
+    (tmp_path / "rig.yaml").write_text(_RIG)
+    path = _record(tmp_path / "a.mcap")
+
+    out = await _run(path, {"scans": "/points", "imu": "/imu"}, rig=tmp_path / "rig.yaml")
+
+    scan, imu = out["scans"][1], out["imu"][0]
+    assert (scan.frame, imu.frame) == ("top_lidar", "imu_link")
+    assert scan.stamp_ns == _START_NS + (100 - 3 + 7) * _MS
+    np.testing.assert_allclose(scan.T_base_sensor.t, [1, 2, 3])
+    np.testing.assert_allclose(imu.T_base_sensor.matrix, np.eye(4))
 
 
 async def test_a_message_whose_place_is_not_known_at_its_time_is_a_loss(tmp_path: Path) -> None:
@@ -345,7 +374,7 @@ async def test_what_does_not_fit_is_refused_with_a_reason(tmp_path: Path) -> Non
     with pytest.raises(RecordingError, match=r"no topic /pints; there are: /imu, /points"):
         await _run(path, {"scans": "/pints"})
     with pytest.raises(ValidationError, match=r"no message 'Scan'; known: CameraFrame"):
-        McapSourceConfig(path=path, topics={"x": {"topic": "/points", "type": "Scan"}})
+        McapSourceConfig(path=path, topics={"x": TopicConfig(topic="/points", type="Scan")})
     with pytest.raises(ValidationError, match="no topics"):
         McapSourceConfig(path=path, topics={})
     image = Channel(
@@ -361,7 +390,7 @@ async def test_what_does_not_fit_is_refused_with_a_reason(tmp_path: Path) -> Non
 
 
 def test_ports_have_the_types_that_their_names_say(tmp_path: Path) -> None:
-    topics = {
+    topics: dict[str, Any] = {
         "scans": "/a", "scans_rear": "/b", "imu": "/c", "things": "/d",
         "other": {"topic": "/e", "type": "Odometry"},
     }  # fmt: skip

@@ -1,0 +1,91 @@
+"""Compressed images to pixels."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import cv2
+import numpy as np
+from pydantic import Field
+
+from mapstream.operators.operator import Operator, OperatorConfig, pipeline, report_loss
+from mapstream.streams.channel import Receiver, Sender
+from mapstream.streams.messages.sensors import CameraFrame, EncodedImage
+
+_FLAGS = {
+    "color": cv2.IMREAD_COLOR,
+    "gray": cv2.IMREAD_GRAYSCALE,
+    "as_recorded": cv2.IMREAD_UNCHANGED,
+}
+
+
+class ImageDecodeConfig(OperatorConfig):
+    mode: Literal["color", "gray", "as_recorded"] = Field(
+        default="as_recorded",
+        description="color is bgr8, gray is mono8; 16 bits stay only as recorded",
+    )
+
+
+@dataclass(frozen=True)
+class Inputs:
+    images: Receiver[EncodedImage]
+
+
+@dataclass(frozen=True)
+class Outputs:
+    frames: Sender[CameraFrame]
+
+
+class ImageDecode(Operator[Inputs, Outputs]):
+    """Decode JPEG, PNG and what else OpenCV reads; one that cannot be decoded is dropped and counted.
+
+    OpenCV frees the interpreter while it decodes, so several workers decode at the same time.
+    """
+
+    placement = "thread"
+
+    def __init__(self, config: ImageDecodeConfig) -> None:
+        self._flag = _FLAGS[config.mode]
+
+    async def run(self, inputs: Inputs, outputs: Outputs) -> None:
+        async def send(result: CameraFrame | _Refused) -> None:
+            if isinstance(result, CameraFrame):
+                await outputs.frames.send(result)
+            else:
+                report_loss(f"images of {result.frame} that cannot be decoded ({result.format})")
+                outputs.frames.advance(result.stamp_ns)
+
+        await pipeline(self.decode, inputs.images, send)
+
+    def decode(self, image: EncodedImage) -> CameraFrame | _Refused:
+        """Decode one image."""
+        try:
+            pixels = cv2.imdecode(image.data, self._flag) if image.data.size else None
+        except cv2.error:
+            pixels = None
+        if pixels is None:
+            return _Refused(image.stamp_ns, image.frame, image.format)
+        if pixels.ndim == 3 and pixels.shape[2] == 4:
+            pixels = np.ascontiguousarray(pixels[:, :, :3])  # without alpha
+        encoding = "bgr8" if pixels.ndim == 3 else _GRAY.get(pixels.dtype.name)
+        if encoding is None or (pixels.ndim == 3 and pixels.dtype != np.uint8):
+            return _Refused(image.stamp_ns, image.frame, f"{image.format} of {pixels.dtype}")
+        return CameraFrame(
+            stamp_ns=image.stamp_ns,
+            image=pixels,
+            encoding=encoding,
+            frame=image.frame,
+            T_base_sensor=image.T_base_sensor,
+            record=image.record,
+        )
+
+
+_GRAY = {"uint8": "mono8", "uint16": "mono16", "float32": "32FC1"}
+
+
+@dataclass(frozen=True, slots=True)
+class _Refused:
+    stamp_ns: int
+    frame: str
+    format: str
