@@ -63,7 +63,12 @@ def demo(
     recording, map_folder, picture = folder / "drive.mcap", folder / "map", folder / "run.rrd"
     config = WORLDS[chosen.world].config_type.model_validate(chosen.options)
     write_world(chosen.world, recording, config, seed=seed)
-    request = Request(graph=chosen.graph, recording=recording, params={"map": str(map_folder)})
+    request = Request(
+        graph=chosen.graph,
+        recording=recording,
+        params={"map": str(map_folder)},
+        sets=["store.on_existing=replace"],  # a demo may be run again
+    )
     plan = plan_request(request).plan
     report, notes = execute(plan, rerun=rerun or f"save={picture}", has_progress=not json)
     if report.status == "failed":
