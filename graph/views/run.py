@@ -14,7 +14,7 @@ from mapstream.graph.views.colors import ramp_colors
 from mapstream.graph.views.scene import Columns, Drawing, Entry, Scene
 
 GRAPH = "/run/graph"
-_COLUMN, _ROW = 240.0, 130.0  # distances between nodes of the drawing
+_COLUMN, _ROW = 240.0, 85.0  # distances between nodes of the drawing
 _FAILED = 0xFF5252FF
 
 
