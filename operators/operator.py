@@ -12,7 +12,6 @@ a jump of the clock the runtime makes a new operator and runs it, unless `spans_
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections import deque
 from collections.abc import Awaitable, Callable
 from contextvars import ContextVar
 from dataclasses import dataclass, field
@@ -165,37 +164,36 @@ class _ThreadCall(Generic[R]):
 async def pipeline(
     function: Callable[[M], R], messages: Receiver[M], send: Callable[[R], Awaitable[None]]
 ) -> None:
-    """Call a stateless function on each message, `workers` at a time, and send the results in order."""
+    """Call a stateless function on each message, `workers` at a time, and send the results in order.
+
+    A result is sent as soon as those before it are; so is an error raised.
+    """
     ctx = context()
     if ctx.workers == 1 or ctx.placement != "thread":
         async for message in messages:
             await send(await offload(function, message))
         return
+
+    async def work(message: M, turn: anyio.Event, next_turn: anyio.Event) -> None:
+        try:
+            result = await offload(function, message)
+        except Exception:
+            await turn.wait()
+            raise
+        await turn.wait()
+        await send(result)
+        next_turn.set()
+        free.release()
+
+    free = anyio.Semaphore(ctx.workers)
+    turn = anyio.Event()
+    turn.set()
     async with anyio.create_task_group() as tasks:
-        pending: deque[_Pending[R]] = deque()
         async for message in messages:
-            pending.append(_Pending())
-            tasks.start_soon(pending[-1].fill, function, message)
-            if len(pending) == ctx.workers:
-                await send(await pending.popleft().result())
-        while pending:
-            await send(await pending.popleft().result())
-
-
-class _Pending(Generic[R]):
-    """A result that is still to come."""
-
-    def __init__(self) -> None:
-        self._done = anyio.Event()
-        self._result: list[R] = []
-
-    async def fill(self, function: Callable[[M], R], message: M) -> None:
-        self._result.append(await offload(function, message))
-        self._done.set()
-
-    async def result(self) -> R:
-        await self._done.wait()
-        return self._result[0]
+            await free.acquire()
+            next_turn = anyio.Event()
+            tasks.start_soon(work, message, turn, next_turn)
+            turn = next_turn
 
 
 class Operator(ABC, Generic[InputsT, OutputsT]):
