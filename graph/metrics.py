@@ -38,7 +38,7 @@ class EdgeSnapshot:
     @property
     def lost(self) -> dict[str, int]:
         """Messages that were dropped against the receiver's will, by reason."""
-        return {reason: n for reason, n in self.dropped.items() if n and reason != _UNREAD}
+        return {reason: n for reason, n in self.dropped.items() if reason != _UNREAD}
 
     @property
     def num_lost(self) -> int:
@@ -180,7 +180,7 @@ def _edge(link: Link) -> EdgeSnapshot:
         depth=len(channel),
         capacity=channel.capacity,
         high_water=stats.high_water,
-        dropped=dict(stats.dropped),
+        dropped={reason: count for reason, count in stats.dropped.items() if count},
         late=stats.late,
         grown=stats.grown,
         blocked_s=stats.blocked_ns / 1e9,

@@ -16,7 +16,7 @@ import anyio
 from mapstream.graph.links import Link, edges_with_epochs
 from mapstream.graph.metrics import Meter, Snapshot
 from mapstream.graph.observed import ObservedSender, Tap, Taps
-from mapstream.graph.plan import Node, Plan
+from mapstream.graph.plan import Edge, Node, Plan
 from mapstream.graph.remote import RemoteStage
 from mapstream.graph.report import RunReport, report_of
 from mapstream.graph.spec import OnErrorSpec
@@ -25,9 +25,11 @@ from mapstream.graph.stop import Stop
 from mapstream.graph.watch import Watch
 from mapstream.operators.operator import Context
 from mapstream.streams.channel import Channel, Receiver, Sender
-from mapstream.streams.clock import Clock, WallClock
+from mapstream.streams.clock import Clock, ReplayClock, WallClock
 from mapstream.streams.errors import OperatorError
+from mapstream.streams.spool import DiskSpool
 
+_SPOOL_BYTES = 2**31  # on disk, per edge with the policy `spool`
 _log = logging.getLogger(__name__)
 
 
@@ -44,14 +46,14 @@ async def run_graph(
 
     Args:
         plan: What to run.
-        clock: Event time; the wall if None.
+        clock: Event time; as the plan's profile says if None.
         taps: Called with each message that is sent, on the event loop: they must not wait.
         on_progress: Called with a snapshot every `progress_period_s`, and with the last one.
         progress_period_s: Wall time between two snapshots.
         stop: A request makes the sources end; what is under way is finished and saved. The second
             request cancels everything.
     """
-    run = _Run(plan, clock or WallClock(), taps, stop or Stop())
+    run = _Run(plan, clock or clock_of(plan), taps, stop or Stop())
     async with anyio.create_task_group() as background:
         background.start_soon(run.watch.run)
         background.start_soon(run.obey)
@@ -68,6 +70,19 @@ async def run_graph(
     return report
 
 
+def clock_of(plan: Plan) -> Clock:
+    """Return the clock that the profile of a plan asks for."""
+    spec = plan.profile.clock
+    if spec.from_ == "wall":
+        return WallClock()
+    return ReplayClock(None if spec.rate == "max" else spec.rate)
+
+
+def _channel(edge: Edge) -> Channel[Any]:
+    spool = DiskSpool(_SPOOL_BYTES) if edge.limits.policy == "spool" else None
+    return Channel(edge.name, edge.limits, spool)
+
+
 class _Run:
     """A plan with everything opened."""
 
@@ -77,7 +92,7 @@ class _Run:
         self._stop = stop
         self._taps = Taps(taps)
         self.scope = anyio.CancelScope()
-        self._links = [Link(edge, Channel(edge.name, edge.limits)) for edge in plan.edges]
+        self._links = [Link(edge, _channel(edge)) for edge in plan.edges]
         self._marked = edges_with_epochs(plan)
         self.stages = {name: self._stage(node) for name, node in plan.nodes.items()}
         self.watch = Watch(self.stages, self._links, self._on_deadlock)
