@@ -1,0 +1,1 @@
+"""Public data sets and other recordings, rewritten as MCAP."""

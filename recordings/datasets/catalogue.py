@@ -1,0 +1,95 @@
+"""Converters by name: `kitti:DIR` and so on become MCAP files."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from mapstream.recordings.datasets.conversion import Convert, Notices, Progress
+from mapstream.recordings.datasets.kitti import convert_kitti
+from mapstream.recordings.datasets.lidar_bins import convert_lidar_bins
+from mapstream.recordings.mcap_writer import McapWriter
+from mapstream.recordings.recording import open_recording
+from mapstream.recordings.trajectory_files import read_tum
+from mapstream.streams.errors import ConfigError, RecordingError
+from mapstream.streams.geometry import SE3
+from mapstream.streams.messages.estimates import Odometry
+
+
+@dataclass(frozen=True, slots=True)
+class Converter:
+    """One kind of source."""
+
+    summary: str
+    convert: Convert
+
+
+def convert_tum(source: Path, writer: McapWriter, on_progress: Progress) -> Notices:
+    """Write the poses of a TUM file as `/odometry`."""
+    trajectory = read_tum(source)
+    rows = zip(trajectory.stamps_ns.tolist(), trajectory.poses, strict=True)
+    for index, (stamp_ns, T) in enumerate(rows):
+        writer.write("/odometry", Odometry(stamp_ns=stamp_ns, T_odom_base=SE3(T)))
+        on_progress((index + 1) / len(trajectory))
+    return ()
+
+
+def convert_rosbag(source: Path, writer: McapWriter, on_progress: Progress) -> Notices:
+    """Write the messages of any recording as they are, bytes and schemas."""
+    with open_recording(source) as recording:
+        span_ns = max(1, recording.end_ns - recording.start_ns)
+        for message in recording.messages():
+            writer.write_raw(message.channel, message.data, message.log_ns)
+            on_progress((message.log_ns - recording.start_ns) / span_ns)
+        return tuple(f"lost at byte {loss.offset}: {loss.reason}" for loss in recording.losses)
+
+
+CONVERTERS = {
+    "kitti": Converter("folder of KITTI odometry scans", convert_kitti),
+    "lidar_bins": Converter("folder of deskewed scans with alidarPose.csv", convert_lidar_bins),
+    "rosbag": Converter("ROS 1 bag, rosbag2 or MCAP", convert_rosbag),
+    "tum": Converter("TUM trajectory", convert_tum),
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Conversion:
+    """What came of it."""
+
+    path: Path
+    num_messages: int
+    notices: Notices
+
+
+def convert(
+    spec: str, out: str | Path, *, on_progress: Callable[[float], None] | None = None
+) -> Conversion:
+    """Rewrite a data set as MCAP; the file is there whole or not at all.
+
+    Args:
+        spec: Kind and place, as `kitti:DIR`; kinds are the keys of `CONVERTERS`.
+        out: The file to write; one that exists is replaced.
+        on_progress: Called with the fraction done.
+
+    Raises:
+        ConfigError: If the kind is unknown, or there is nothing at the place.
+        RecordingError: If the source cannot be read, or the file not be written.
+    """
+    kind, colon, place = spec.partition(":")
+    if not colon or kind not in CONVERTERS:
+        kinds = ", ".join(f"{name}:PATH" for name in CONVERTERS)
+        raise ConfigError(f"{spec!r} is no source to convert; expected one of {kinds}")
+    source, out = Path(place), Path(out)
+    if not source.exists():
+        raise ConfigError(f"{spec}: there is nothing at {source}")
+    part = out.with_name(out.name + ".part")
+    try:
+        with McapWriter(part) as writer:
+            notices = CONVERTERS[kind].convert(source, writer, on_progress or (lambda _: None))
+        part.replace(out)
+    except OSError as error:
+        raise RecordingError(f"{out}: cannot be written: {error}") from error
+    finally:
+        part.unlink(missing_ok=True)
+    return Conversion(out, writer.num_messages, notices)
