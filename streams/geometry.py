@@ -162,6 +162,8 @@ class SE3:
         R = matrix[:3, :3]
         if np.abs(R @ R.T - np.eye(3)).max() > 1e-3 or np.linalg.det(R) < 0:  # float32 files round
             raise ValueError(f"not a rotation: {R.tolist()}")
+        if matrix[3].tolist() != [0, 0, 0, 1]:
+            raise ValueError(f"the last row of a transform is 0 0 0 1, not {matrix[3].tolist()}")
         matrix.flags.writeable = False
         object.__setattr__(self, "matrix", matrix)
 

@@ -33,6 +33,16 @@ class Trajectory:
     def covers(self, stamp_ns: int) -> bool:
         return len(self) > 0 and int(self.stamps_ns[0]) <= stamp_ns <= int(self.stamps_ns[-1])
 
+    def stamp_before(self, stamp_ns: int) -> int | None:
+        """Return the last stamp before another, which need not be one of a pose; None at the start."""
+        index = int(np.searchsorted(self.stamps_ns, stamp_ns, side="left"))
+        return int(self.stamps_ns[index - 1]) if index else None
+
+    def stamp_after(self, stamp_ns: int) -> int | None:
+        """Return the first stamp after another, which need not be one of a pose; None at the end."""
+        index = int(np.searchsorted(self.stamps_ns, stamp_ns, side="right"))
+        return int(self.stamps_ns[index]) if index < len(self) else None
+
     def at(self, stamps_ns: npt.ArrayLike) -> FloatArray:
         """Return poses (M, 4, 4) at stamps (M,), interpolated between neighbours.
 
