@@ -78,8 +78,13 @@ class McapWriter:
         """Write encoded bytes to a channel.
 
         Raises:
-            RecordingError: If the topic holds another schema already, or the disk is full.
+            RecordingError: If the topic holds another schema already, the time is negative, or the
+                disk is full.
         """
+        if not 0 <= log_ns < 2**63:
+            raise RecordingError(
+                f"{self.path}: {channel.topic}: {log_ns} ns is no time that MCAP can hold"
+            )
         channel_id = self._channel_id(channel)
         sequence = self._sequences[channel.topic]
         self._sequences[channel.topic] += 1

@@ -35,6 +35,18 @@ _TYPES: dict[str, type[Any]] = {  # by the name of a port
 }
 
 
+def check_message_name(name: str | None) -> str | None:
+    """Refuse names of messages that do not exist.
+
+    Raises:
+        ValueError: With the known names.
+    """
+    known = known_messages()
+    if name is not None and name not in known:
+        raise ValueError(f"no message {name!r}; known: {', '.join(sorted(known))}")
+    return name
+
+
 class TopicConfig(OperatorConfig):
     topic: str
     type: str | None = Field(
@@ -46,13 +58,7 @@ class TopicConfig(OperatorConfig):
         default=None, description="the sensor's frame, if not the recorded one"
     )
 
-    @field_validator("type")
-    @classmethod
-    def _check_type(cls, name: str | None) -> str | None:
-        known = known_messages()
-        if name is not None and name not in known:
-            raise ValueError(f"no message {name!r}; known: {', '.join(sorted(known))}")
-        return name
+    _check_type = field_validator("type")(check_message_name)
 
 
 class McapSourceConfig(OperatorConfig):
@@ -98,8 +104,12 @@ class McapSourceConfig(OperatorConfig):
         return TopicConfig(topic=entry) if isinstance(entry, str) else entry
 
     def message_type(self, port: str) -> Any:  # noqa: ANN401  # Any where nothing says it
-        """Return the type of a port: as given, or by its name (`scans`, `scans_front`)."""
-        given = self.topic(port).type
-        if given is not None:
-            return known_messages()[given]
-        return next((t for name, t in _TYPES.items() if f"{port}_".startswith(f"{name}_")), Any)
+        """Return the type of a port."""
+        return type_of_port(port, self.topic(port).type)
+
+
+def type_of_port(port: str, given: str | None) -> Any:  # noqa: ANN401
+    """Return a message type as given, or by the port's name (`scans`, `scans_front`); Any otherwise."""
+    if given is not None:
+        return known_messages()[given]
+    return next((t for name, t in _TYPES.items() if f"{port}_".startswith(f"{name}_")), Any)

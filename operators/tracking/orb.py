@@ -60,7 +60,7 @@ class Orb(Operator[Inputs, Outputs]):
         points = np.array([k.pt for k in keypoints], np.float32).reshape(-1, 2)
         angles = np.fromiter((k.angle for k in keypoints), np.float32, count)
         scales = np.fromiter((k.size for k in keypoints), np.float32, count)
-        if descriptors is None:
+        if count == 0:  # OpenCV returns None
             descriptors = np.empty((0, _DESCRIPTOR_BYTES), np.uint8)
         return ImageFeatures(
             stamp_ns=frame.stamp_ns,

@@ -55,7 +55,7 @@ class Beacon:
 def one_of_each(seed: int) -> list[Any]:
     """Return messages whose optional parts are there or not, by the seed."""
     rng = np.random.default_rng(seed)
-    stamp = int(rng.integers(-(2**62), 2**62))
+    stamp = int(rng.integers(1, 2**62))
     n = int(rng.integers(0, 5))
     mission = rng.bytes(16).hex()
 
@@ -89,7 +89,7 @@ def one_of_each(seed: int) -> list[Any]:
     return [
         LidarScan(
             stamp_ns=stamp, points=points, intensity=maybe(intensity),
-            ring=maybe(np.arange(n, dtype=np.uint16)), offsets_ns=maybe(np.arange(n)),
+            ring=maybe(np.arange(n, dtype=np.uint16)), offsets_ns=maybe(np.arange(n) - 2),
             T_base_sensor=pose(), record=maybe(ref),
         ),
         CameraFrame(stamp_ns=stamp, image=rng.integers(0, 255, (4, 5, 3), np.uint8), encoding="bgr8"),

@@ -90,6 +90,8 @@ def test_refusals(tmp_path: Path) -> None:
         RecordingError, match=r"topic /x holds mapstream.Odometry; give sensor_msgs"
     ):
         writer.write_raw(other, b"", 1)
+    with pytest.raises(RecordingError, match=r"/y: -5 ns is no time that MCAP can hold"):
+        writer.write("/y", _odometry(-5))
     writer.close()
     writer.close()
     with pytest.raises(RecordingError, match=r"a.mcap: was closed"):

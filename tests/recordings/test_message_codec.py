@@ -17,6 +17,7 @@ from mapstream.recordings.recording import Channel, RawMessage
 from mapstream.streams.errors import DecodeError
 from mapstream.streams.geometry import SE3
 from mapstream.streams.messages.estimates import PointCloud
+from mapstream.streams.messages.sensors import WheelOdometry
 from tests.recordings.made_messages import Beacon, Detection, one_of_each
 
 
@@ -70,14 +71,16 @@ def test_the_examples_cover_every_message_class() -> None:
 
 
 def test_the_schema_describes_everything_that_is_inside() -> None:
-    (file,) = FileDescriptorSet.FromString(schema_of(PointCloud)).file
+    (file,) = FileDescriptorSet.FromString(schema_of(WheelOdometry)).file
 
     assert file.package == "mapstream"
-    assert [message.name for message in file.message_type] == ["PointCloud", "Array"]
+    assert [message.name for message in file.message_type] == [
+        "WheelOdometry",
+        "Transform",
+        "Array",
+    ]
     assert [field.name for field in file.message_type[0].field] == [
-        "stamp_ns",
-        "points",
-        "intensity",
+        field.name for field in fields(WheelOdometry)
     ]
 
 
