@@ -64,6 +64,10 @@ class Outlet(Sender[Any]):
         self._credits = CREDITS
         self.room = Waiters()
 
+    @property
+    def is_connected(self) -> bool:
+        return True  # outputs that nobody reads have no outlet
+
     async def send(self, message: Any) -> None:  # noqa: ANN401  # of any channel
         if self._is_closed:
             raise ChannelError("a message was sent after the end of the stream")

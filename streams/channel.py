@@ -166,6 +166,11 @@ class Sender(Generic[T_contra]):
     def __init__(self, channels: Sequence[Channel[T_contra]] = ()) -> None:
         self.channels = tuple(channels)
 
+    @property
+    def is_connected(self) -> bool:
+        """False if nobody will read, so that costly messages need not be made."""
+        return bool(self.channels)
+
     async def send(self, message: T_contra) -> None:
         """Send one message; waits where a channel blocks.
 
