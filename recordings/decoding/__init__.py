@@ -16,6 +16,7 @@ from mapstream.recordings.decoding.cursor import CdrCursor, Ros1Cursor
 from mapstream.recordings.decoding.decoder import Decoder, Parse
 from mapstream.recordings.message_schema import PACKAGE
 from mapstream.recordings.recording import Channel
+from mapstream.streams.calibration import CameraCalibration
 from mapstream.streams.errors import DecodeError
 from mapstream.streams.messages.estimates import Odometry
 from mapstream.streams.messages.sensors import (
@@ -41,6 +42,7 @@ _ROS: list[tuple[str, type[Any], _Read]] = [
     ("livox_ros_driver2/CustomMsg", LidarScan, ros_clouds.livox),
     ("sensor_msgs/Image", CameraFrame, ros_images.image),
     ("sensor_msgs/CompressedImage", EncodedImage, ros_images.compressed_image),
+    ("sensor_msgs/CameraInfo", CameraCalibration, ros_images.camera_info),
     ("sensor_msgs/LaserScan", LaserScan2D, ros.laser_scan),
     ("sensor_msgs/NavSatFix", GnssFix, ros.nav_sat_fix),
     ("nav_msgs/Odometry", Odometry, ros.odometry),
@@ -54,6 +56,7 @@ _FOXGLOVE: list[tuple[str, type[Any], _Read]] = [
     ("foxglove.PointCloud", LidarScan, foxglove.point_cloud),
     ("foxglove.RawImage", CameraFrame, foxglove.raw_image),
     ("foxglove.CompressedImage", EncodedImage, foxglove.compressed_image),
+    ("foxglove.CameraCalibration", CameraCalibration, foxglove.camera_calibration),
     ("foxglove.LocationFix", GnssFix, foxglove.location_fix),
     ("foxglove.LaserScan", LaserScan2D, foxglove.laser_scan),
     ("foxglove.PoseInFrame", Odometry, foxglove.pose_in_frame),
@@ -76,6 +79,8 @@ def decoder_for(channel: Channel, message_type: type[Any] | None = None) -> Deco
     name, encoding = schema_key(channel), channel.message_encoding
     if encoding == "protobuf" and name.startswith(f"{PACKAGE}."):
         own_type, decode = message_codec.decoder(name, channel.schema_data)
+        if message_type not in (None, own_type):
+            raise _wrong_type(channel, [own_type], message_type)
         return Decoder(channel, own_type, decode)
     table = _FOXGLOVE if encoding in ("protobuf", "json") else _ROS
     found = [(t, read) for n, t, read in table if n == name]
@@ -89,9 +94,7 @@ def decoder_for(channel: Channel, message_type: type[Any] | None = None) -> Deco
         raise DecodeError(f"{channel.topic}: no decoder for {what} in {encoding}; known: {known}")
     matching = [pair for pair in found if message_type in (None, pair[0])]
     if not matching:
-        given = ", ".join(t.__name__ for t, _ in found)
-        wanted = getattr(message_type, "__name__", message_type)
-        raise DecodeError(f"{channel.topic}: {name} decodes to {given}, not to {wanted}")
+        raise _wrong_type(channel, [t for t, _ in found], message_type)
     found_type, read = matching[0]
     notices: Counter[str] = Counter()
     is_fast = found_type is ImuBatch and encoding == "cdr"
@@ -102,6 +105,12 @@ def decoder_for(channel: Channel, message_type: type[Any] | None = None) -> Deco
         parse_many=ros.imu_batch if is_fast else None,
         notices=notices,
     )
+
+
+def _wrong_type(channel: Channel, found: list[type[Any]], wanted: Any) -> DecodeError:  # noqa: ANN401
+    given = ", ".join(kind.__name__ for kind in found)
+    name = getattr(wanted, "__name__", wanted)
+    return DecodeError(f"{channel.topic}: {schema_key(channel)} decodes to {given}, not to {name}")
 
 
 def message_type_of(channel: Channel) -> type[Any] | None:
