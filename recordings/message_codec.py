@@ -32,6 +32,7 @@ from mapstream.recordings.message_schema import (
     schema_name,
     schema_of,
 )
+from mapstream.streams import calibration
 from mapstream.streams.errors import DecodeError
 from mapstream.streams.geometry import SE3
 from mapstream.streams.messages import estimates, sensors
@@ -113,7 +114,7 @@ def known_messages() -> dict[str, type[Any]]:
     """Return message classes by name."""
     known = {
         name: cls
-        for module in (sensors, estimates)
+        for module in (sensors, estimates, calibration)
         for name, cls in vars(module).items()
         if isinstance(cls, type) and is_dataclass(cls) and cls.__module__ == module.__name__
     }

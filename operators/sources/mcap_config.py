@@ -9,6 +9,7 @@ from pydantic import Field, NonNegativeFloat, PositiveFloat, field_validator
 
 from mapstream.operators.operator import OperatorConfig
 from mapstream.recordings.message_codec import known_messages
+from mapstream.streams.calibration import CameraCalibration
 from mapstream.streams.messages.estimates import Odometry, PointCloud
 from mapstream.streams.messages.sensors import (
     CameraFrame,
@@ -32,6 +33,7 @@ _TYPES: dict[str, type[Any]] = {  # by the name of a port
     "laser": LaserScan2D,
     "clouds": PointCloud,
     "transforms": TransformBatch,
+    "calibrations": CameraCalibration,
 }
 
 

@@ -24,7 +24,8 @@ from mapstream.recordings.decoding.point_fields import (
     points_view,
     scan_of,
 )
-from mapstream.recordings.decoding.ros_images import pixels_of
+from mapstream.recordings.decoding.ros_images import calibration_of, pixels_of
+from mapstream.streams.calibration import CameraCalibration
 from mapstream.streams.geometry import SE3
 from mapstream.streams.messages.estimates import Odometry
 from mapstream.streams.messages.sensors import (
@@ -137,6 +138,18 @@ def compressed_image(message: Any) -> EncodedImage:  # noqa: ANN401
         data=np.frombuffer(message.data, np.uint8),
         format="jpeg" if message.format == "jpg" else message.format,
         frame=message.frame_id or "camera",
+    )
+
+
+def camera_calibration(message: Any) -> CameraCalibration:  # noqa: ANN401
+    """Read a foxglove.CameraCalibration."""
+    return calibration_of(
+        message.distortion_model,
+        np.array(message.D, np.float64),
+        np.array(message.K, np.float64),
+        size_px=(message.width, message.height),
+        stamp_ns=_stamp_ns(message),
+        frame=message.frame_id,
     )
 
 

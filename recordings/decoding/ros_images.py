@@ -6,7 +6,8 @@ import numpy as np
 import numpy.typing as npt
 
 from mapstream.recordings.decoding.cursor import CdrCursor
-from mapstream.streams.messages.sensors import CameraFrame, EncodedImage
+from mapstream.streams.calibration import CameraCalibration, Distortion
+from mapstream.streams.messages.sensors import CameraFrame, EncodedImage, FloatArray
 
 # encoding in ROS -> dtype, channels, encoding of ours
 _ENCODINGS = {
@@ -20,6 +21,14 @@ _ENCODINGS = {
     "mono16": ("u2", 1, "mono16"),
     "16UC1": ("u2", 1, "16UC1"),
     "32FC1": ("f4", 1, "32FC1"),
+}
+_DISTORTIONS: dict[str, Distortion] = {  # name in ROS and Foxglove -> ours
+    "": "none",
+    "none": "none",
+    "plumb_bob": "radtan",
+    "equidistant": "equidistant",
+    "fisheye": "equidistant",
+    "rational_polynomial": "rational_polynomial",
 }
 _COMPRESSED_DEPTH_HEADER = 12  # bytes that image_transport puts before the PNG
 
@@ -88,3 +97,52 @@ def _format(text: str) -> str:
     known = ("jpeg", "jpg", "png", "tiff", "webp", "h264", "h265")
     found = next((name for name in known if name in text.lower()), text or "jpeg")
     return "jpeg" if found == "jpg" else found
+
+
+def camera_info(cursor: CdrCursor) -> CameraCalibration:
+    """Read the intrinsics of a sensor_msgs/CameraInfo; binning and region of interest are refused."""
+    stamp_ns, frame = cursor.header()
+    height, width, name = cursor.u32(), cursor.u32(), cursor.text()
+    parameters, K = cursor.sequence("<f8"), cursor.array("<f8", 9)
+    cursor.array("<f8", 9 + 12)  # rectification, projection
+    binning, region = cursor.array("<u4", 2), cursor.array("<u4", 4)
+    cursor.u8()
+    cursor.end()
+    if (binning > 1).any() or region[:2].any():
+        raise ValueError("binning and regions of interest are not supported")
+    return calibration_of(
+        name, parameters, K, size_px=(width, height), stamp_ns=stamp_ns, frame=frame
+    )
+
+
+def calibration_of(
+    name: str,
+    parameters: FloatArray,
+    K: FloatArray,
+    *,
+    size_px: tuple[int, int],
+    stamp_ns: int,
+    frame: str,
+) -> CameraCalibration:
+    """Return a pinhole camera with a distortion as ROS names it.
+
+    Raises:
+        ValueError: If the distortion is not known, or the camera is not calibrated.
+    """
+    if name not in _DISTORTIONS:
+        raise ValueError(f"distortion {name!r}; known: {', '.join(filter(None, _DISTORTIONS))}")
+    distortion = _DISTORTIONS[name] if parameters.any() else "none"
+    if distortion == "rational_polynomial" and not parameters[5:].any():
+        distortion, parameters = "radtan", parameters[:5]
+    if not K.any():
+        raise ValueError("the camera is not calibrated: all of K is zero")
+    return CameraCalibration(
+        stamp_ns=stamp_ns,
+        frame=frame or "camera",
+        width_px=size_px[0],
+        height_px=size_px[1],
+        focal_px=K[[0, 4]],
+        center_px=K[[2, 5]],
+        distortion=distortion,
+        distortion_parameters=np.empty(0) if distortion == "none" else parameters,
+    )

@@ -5,6 +5,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from mapstream.streams.calibration import CameraCalibration
 from mapstream.streams.geometry import SE3
 from mapstream.streams.messages.estimates import (
     ImageFeatures,
@@ -108,6 +109,10 @@ def one_of_each(seed: int) -> list[Any]:
         GnssFix(
             stamp_ns=stamp, latitude_deg=47.1, longitude_deg=8.2, altitude_m=-0.0,
             covariance_enu_m2=maybe(np.eye(3)),
+        ),
+        CameraCalibration(
+            stamp_ns=stamp, width_px=640, height_px=480, focal_px=rng.random(2) + 400,
+            center_px=rng.random(2) + 200, distortion="radtan", distortion_parameters=rng.random(4),
         ),
         WheelOdometry(stamp_ns=stamp, T_odom_base=pose(), covariance=maybe(covariance())),
         TransformBatch(

@@ -373,7 +373,7 @@ async def test_what_does_not_fit_is_refused_with_a_reason(tmp_path: Path) -> Non
 
     with pytest.raises(RecordingError, match=r"no topic /pints; there are: /imu, /points"):
         await _run(path, {"scans": "/pints"})
-    with pytest.raises(ValidationError, match=r"no message 'Scan'; known: CameraFrame"):
+    with pytest.raises(ValidationError, match=r"no message 'Scan'; known: CameraCalibration"):
         McapSourceConfig(path=path, topics={"x": TopicConfig(topic="/points", type="Scan")})
     with pytest.raises(ValidationError, match="no topics"):
         McapSourceConfig(path=path, topics={})

@@ -45,6 +45,10 @@ _MESSAGES: dict[str, dict[str, Any]] = {
         "timestamp": _TIME, "frame_id": "laser", "start_angle": -1.0, "end_angle": 1.0,
         "ranges": [1.0, 0.0, 3.0], "intensities": [],
     },
+    "CameraCalibration": {
+        "timestamp": _TIME, "frame_id": "cam", "width": 4, "height": 2, "D": [],
+        "distortion_model": "plumb_bob", "K": [9, 0, 2, 0, 8, 1, 0, 0, 1],
+    },
     "PoseInFrame": {"timestamp": _TIME, "frame_id": "odom", "pose": _POSE},
     "FrameTransform": {
         "timestamp": _TIME, "parent_frame_id": "base", "child_frame_id": "lidar",

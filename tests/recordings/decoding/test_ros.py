@@ -7,6 +7,7 @@ import pytest
 
 from mapstream.recordings.decoding import decoder_for, message_type_of
 from mapstream.recordings.recording import Channel, RawMessage
+from mapstream.streams.calibration import CameraCalibration
 from mapstream.streams.errors import DecodeError
 from mapstream.streams.messages.estimates import Odometry
 from mapstream.streams.messages.sensors import (
@@ -267,6 +268,45 @@ def test_compressed_images(encoding: str) -> None:
     assert isinstance(jpeg, EncodedImage)
     assert (jpeg.format, jpeg.data.tolist()) == ("jpeg", list(range(20)))
     assert (depth.format, depth.data.tolist()) == ("png", list(range(12, 20)))
+
+
+def _camera_info(encoding: str, /, **fields: object) -> RawMessage:
+    region = make(encoding, "sensor_msgs/RegionOfInterest", x_offset=0, y_offset=0, height=0, width=0,
+                  do_rectify=False)  # fmt: skip
+    names = ["d", "k", "r", "p"] if encoding == "cdr" else ["D", "K", "R", "P"]
+    K = np.array([500.0, 0, 320, 0, 510, 240, 0, 0, 1])
+    values = [np.array([0.1, 0.2, 0.3, 0.4, 0.5]), K, np.eye(3).ravel(), np.zeros(12)]
+    given = {"header": header(encoding, "cam"), "height": 480, "width": 640,
+             "distortion_model": "plumb_bob", "binning_x": 0, "binning_y": 0, "roi": region}  # fmt: skip
+    message = make(
+        encoding, "sensor_msgs/CameraInfo", **given | dict(zip(names, values, strict=True)) | fields
+    )
+    return raw(encoding, "sensor_msgs/CameraInfo", message)
+
+
+@both
+def test_camera_info(encoding: str) -> None:
+    camera = _decode(_camera_info(encoding))
+
+    assert isinstance(camera, CameraCalibration)
+    assert (camera.width_px, camera.height_px, camera.distortion) == (640, 480, "radtan")
+    assert camera.distortion_parameters.tolist() == [0.1, 0.2, 0.3, 0.4, 0.5]
+    assert camera.camera_matrix.tolist() == [[500, 0, 320], [0, 510, 240], [0, 0, 1]]
+
+
+def test_camera_info_that_says_too_little_or_too_much() -> None:
+    none = _decode(_camera_info("cdr", d=np.zeros(5)))
+    rational = _decode(
+        _camera_info("cdr", distortion_model="rational_polynomial", d=np.arange(8.0))
+    )
+
+    assert (none.distortion, rational.distortion) == ("none", "rational_polynomial")
+    with pytest.raises(DecodeError, match="not calibrated: all of K is zero"):
+        _decode(_camera_info("cdr", k=np.zeros(9)))
+    with pytest.raises(DecodeError, match="distortion 'odd'; known: none, plumb_bob"):
+        _decode(_camera_info("cdr", distortion_model="odd"))
+    with pytest.raises(DecodeError, match="binning"):
+        _decode(_camera_info("cdr", binning_x=2))
 
 
 @both
