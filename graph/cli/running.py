@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable
 from contextlib import ExitStack
 
@@ -35,7 +34,7 @@ def execute(
     tap = None if spec.kind == "off" else RerunTap(plan, spec.open())
     listeners: list[Callable[[Snapshot], None]] = [] if tap is None else [tap.on_progress]
     with ExitStack() as stack:
-        if has_progress and sys.stderr.isatty():
+        if has_progress:
             listeners.append(stack.enter_context(ProgressBar()))
         try:
             report = anyio.run(_run, plan, [] if tap is None else [tap], listeners)
