@@ -261,6 +261,7 @@ def _rows(cloud: FileCloud, fields: list[tuple[str, str]]) -> npt.NDArray[Any]:
 
 def _write(path: Path, header: Iterable[str], rows: npt.NDArray[Any]) -> None:
     try:
+        path.parent.mkdir(parents=True, exist_ok=True)
         write_whole(path, "".join(f"{line}\n" for line in header).encode() + rows.tobytes())
     except OSError as error:
         raise RecordingError(f"{path}: cannot be written: {error}") from error

@@ -201,6 +201,7 @@ def _number(value: float) -> str:
 def _write(path: Path, lines: Iterable[str]) -> None:
     text = "".join(f"{line}\n" for line in lines)
     try:
+        path.parent.mkdir(parents=True, exist_ok=True)
         write_whole(path, text.encode())
     except OSError as error:
         raise RecordingError(f"{path}: cannot be written: {error}") from error
