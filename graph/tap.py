@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from mapstream.streams.channel import Arrival
 
 MAX_BYTES = 256 * 2**20
+_IMPORT_S = 30.0  # of Rerun, on a busy machine
 _FAREWELL_S = 3.0  # for the last flush and the closing of the sink
 RUN_PATH = "run"  # rates, queues and the operator graph
 
@@ -74,6 +75,7 @@ class RerunTap:
     def close(self) -> None:
         """Draw what waits, and end; a sink that does not get on for its `patience_s` loses the rest."""
         self.queue.close()
+        self._artist.has_asked.wait(_IMPORT_S)
         num_drawn = -1
         while self._thread.is_alive() and self._artist.num_drawn > num_drawn:
             num_drawn = self._artist.num_drawn

@@ -37,6 +37,7 @@ class Artist:
     ) -> None:
         self.num_drawn = 0
         self.errors: Counter[str] = Counter()
+        self.has_asked = Event()  # the sink was asked once: Rerun is imported, which takes long
         self.is_over = Event()  # time is up
         self._plan = plan
         self._outputs = outputs
@@ -49,7 +50,17 @@ class Artist:
         self._flushed_s = time.monotonic()
 
     def run(self) -> None:
-        """Draw until the end; a viewer that does not answer is asked again until time is up."""
+        """Draw until the end; what stops the drawing does not stop the run."""
+        try:
+            self._draw_all()
+        except Exception as error:  # noqa: BLE001  # said at the end of the run
+            _log.exception("drawing ended")
+            self.errors[f"drawing ended: {error}"] += 1
+        finally:
+            self.has_asked.set()
+            self._queue.abandon()
+
+    def _draw_all(self) -> None:
         from mapstream.graph.blueprint import blueprint_of  # noqa: PLC0415  # imports rerun
         from mapstream.graph.views import Scene, ViewSettings  # noqa: PLC0415
 
@@ -59,7 +70,9 @@ class Artist:
             main_odometry=main.path if main else None,
         )
         blueprint = blueprint_of(self._plan, self._outputs)
-        if not self._retry(lambda: self._sink.try_open(blueprint)):
+        is_open = self._sink.try_open(blueprint)
+        self.has_asked.set()
+        if not is_open and not self._retry(lambda: self._sink.try_open(blueprint)):
             self.errors["no viewer answered"] += 1
             return
         while not self._queue.has_ended and not self.is_over.is_set():

@@ -157,6 +157,13 @@ def test_a_drawing_that_fails_is_counted_and_the_rest_is_drawn(tmp_path: Path) -
     assert "/frames/base" in read_rrd(file)
 
 
+def test_a_file_that_cannot_be_written_ends_the_drawing_alone(tmp_path: Path) -> None:
+    with RerunTap(drive_plan(), SinkSpec.parse(f"save={tmp_path}").open()) as tap:
+        tap.queue.put("drive/odometry", made.odometry(0))
+
+    assert any("drawing ended" in note for note in tap.notes())
+
+
 @pytest.mark.parametrize(
     ("text", "complaint"),
     [

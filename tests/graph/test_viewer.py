@@ -57,6 +57,7 @@ async def test_P1_P7_the_viewer_shows_the_map_and_the_operators(
     plan = drive_plan()
     with strict(), RerunTap(plan, SinkSpec.parse(f"connect={viewer_url}").open()) as tap:
         await run_graph(plan, taps=[tap], on_progress=tap.on_progress)
+    assert not [note for note in tap.notes() if "in time" in note]
     client = ViewerClient.connect(viewer_url)
     end_s = time.monotonic() + 30  # another process: all one can do is to ask it again
     for name in ("Map", "Operators"):
