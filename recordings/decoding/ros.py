@@ -133,7 +133,7 @@ def wheel_odometry(cursor: CdrCursor) -> WheelOdometry:
 def _ros_odometry(cursor: CdrCursor) -> tuple[int, SE3, FloatArray, FloatArray]:
     stamp_ns, _ = cursor.header()
     cursor.text()  # child frame
-    pose, covariance = cursor.pose(), cursor.array("<f8", 36)
+    pose, covariance = SE3(cursor.pose()), cursor.array("<f8", 36)
     twist, _ = cursor.array("<f8", 6), cursor.array("<f8", 36)
     cursor.end()
     return stamp_ns, pose, covariance, twist
@@ -150,7 +150,7 @@ def _rotation_first(covariance: FloatArray) -> FloatArray | None:
 def pose(cursor: CdrCursor) -> Odometry:
     """Read a geometry_msgs/PoseStamped."""
     stamp_ns, _ = cursor.header()
-    T_odom_base = cursor.pose()
+    T_odom_base = SE3(cursor.pose())
     cursor.end()
     return Odometry(stamp_ns=stamp_ns, T_odom_base=T_odom_base)
 
@@ -158,7 +158,7 @@ def pose(cursor: CdrCursor) -> Odometry:
 def pose_with_covariance(cursor: CdrCursor) -> Odometry:
     """Read a geometry_msgs/PoseWithCovarianceStamped; the covariance is left out as in `odometry`."""
     stamp_ns, _ = cursor.header()
-    T_odom_base = cursor.pose()
+    T_odom_base = SE3(cursor.pose())
     cursor.array("<f8", 36)
     cursor.end()
     return Odometry(stamp_ns=stamp_ns, T_odom_base=T_odom_base)
@@ -172,7 +172,7 @@ def transforms(cursor: CdrCursor, *, is_static: bool) -> TransformBatch:
         stamps_ns.append(stamp_ns)
         parents.append(parent.lstrip("/"))  # ROS 1 habit
         children.append(cursor.text().lstrip("/"))
-        matrices.append(cursor.pose().matrix)
+        matrices.append(cursor.pose())
     cursor.end()
     return TransformBatch(
         stamps_ns=np.array(stamps_ns, np.int64),

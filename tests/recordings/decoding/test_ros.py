@@ -194,6 +194,19 @@ def test_poses(encoding: str) -> None:
         np.testing.assert_allclose(found.T_odom_base.matrix, _AT_1_2_3, atol=1e-12)
 
 
+def test_a_pose_without_a_direction_is_refused() -> None:
+    zero = make(
+        "cdr",
+        "geometry_msgs/Pose",
+        position=vector("cdr", 1.0, 2.0, 3.0, "Point"),
+        orientation=quaternion("cdr", 0.0, 0.0, 0.0, 0.0),
+    )
+    message = make("cdr", "geometry_msgs/PoseStamped", header=header("cdr"), pose=zero)
+
+    with pytest.raises(DecodeError, match="not a pose"):
+        _decode(raw("cdr", "geometry_msgs/PoseStamped", message))
+
+
 @both
 @pytest.mark.parametrize("topic", ["/tf", "/tf_static"])
 def test_transforms(encoding: str, topic: str) -> None:
