@@ -67,7 +67,7 @@ def say_table(columns: Sequence[str], rows: Sequence[Sequence[object]]) -> None:
     table = Table(box=None, pad_edge=False, header_style="bold")
     for i, name in enumerate(columns):
         is_number = bool(rows) and all(isinstance(row[i], (int, float)) for row in rows)
-        table.add_column(name, justify="right" if is_number else "left", overflow="fold")
+        table.add_column(escape(name), justify="right" if is_number else "left", overflow="fold")
     for row in rows:
         table.add_row(*(escape(_cell(cell)) for cell in row))
     _out.print(table, soft_wrap=False)
@@ -91,11 +91,17 @@ def plain(value: object) -> Any:  # noqa: ANN401  # of a JSON document
         return {str(key): plain(item) for key, item in value.items()}
     if isinstance(value, (list, tuple, set, frozenset)):
         return [plain(item) for item in value]
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
     if hasattr(value, "tolist"):  # of numpy
         return plain(value.tolist())
-    return value if value is None or isinstance(value, (str, int, float)) else str(value)
+    return _plain_leaf(value)
+
+
+def _plain_leaf(value: object) -> str | int | float | None:
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if value is None or isinstance(value, (str, int)):
+        return value
+    return value.__name__ if isinstance(value, type) else str(value)
 
 
 def given(texts: Sequence[str] | None, option: str) -> dict[str, str]:
