@@ -39,7 +39,7 @@ def graph_extent(plan: Plan) -> tuple[tuple[float, float], tuple[float, float]]:
 def view_snapshot(snapshot: Snapshot, scene: Scene) -> Drawing:
     """Plot rates, queues and load, and write them into the operator graph."""
     previous: dict[str, tuple[float, int]] = scene.remember("previous", {})
-    drawing: list[Entry | Columns] = []
+    drawing: list[Entry | Columns] = [*_styles(snapshot)] if scene.once("styles") else []
     for edge in snapshot.edges:
         entity = _entity(edge.name)
         wall_s, sent = previous.get(edge.name, (0.0, 0))
@@ -55,6 +55,28 @@ def view_snapshot(snapshot: Snapshot, scene: Scene) -> Drawing:
         if not math.isnan(operator.p50_s):
             drawing.append(Entry.of(f"call_ms/{operator.name}", rr.Scalars(operator.p50_s * 1e3)))
     return [*drawing, _labels(snapshot)]
+
+
+def _styles(snapshot: Snapshot) -> list[Entry]:
+    """Return colours of lines from blue to red in the order of the flow: the viewer's own repeat."""
+    edges, operators = (
+        [_entity(e.name) for e in snapshot.edges],
+        [o.name for o in snapshot.operators],
+    )
+    plots = {
+        "rates": edges,
+        "queues": edges,
+        "losses": edges,
+        "load": operators,
+        "call_ms": operators,
+    }
+    return [
+        Entry.of(f"{plot}/{name}", rr.SeriesLines(colors=color), is_static=True)
+        for plot, names in plots.items()
+        for name, color in zip(
+            names, ramp_colors(np.linspace(0.1, 0.9, len(names)), 0, 1).tolist(), strict=True
+        )
+    ]
 
 
 def _labels(snapshot: Snapshot) -> Entry:
