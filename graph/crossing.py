@@ -19,7 +19,10 @@ from mapstream.streams.errors import ChannelError
 from mapstream.streams.limits import Entry
 from mapstream.streams.waiting import Waiters
 
-CREDITS = 2  # messages of a port that may be on the other side: one at work, one next
+CREDITS = 2  # messages of an input that may be on the other side: one at work, one next
+CREDITS_BACK = (
+    4  # messages of an output that may be on this side before room is made; given in pairs
+)
 ARRIVAL = struct.Struct("<qqq")  # sequence, arrival, bound
 STAMP = struct.Struct("<q")
 
@@ -61,7 +64,7 @@ class Outlet(Sender[Any]):
         self._pipe = pipe
         self._ring = ring
         self._is_closed = False
-        self._credits = CREDITS
+        self._credits = CREDITS_BACK
         self.room = Waiters()
 
     @property
@@ -76,8 +79,8 @@ class Outlet(Sender[Any]):
         self._credits -= 1
         self._pipe.send(Frame.MESSAGE, self._number, pack(message, self._ring))
 
-    def add_credit(self) -> None:
-        self._credits += 1
+    def add_credits(self, count: int) -> None:
+        self._credits += count
         self.room.wake()
 
     def advance(self, bound_ns: int) -> None:

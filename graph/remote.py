@@ -22,7 +22,7 @@ from typing import Any
 import anyio
 import anyio.abc
 
-from mapstream.graph.crossing import ARRIVAL, CREDITS, STAMP
+from mapstream.graph.crossing import ARRIVAL, CREDITS, CREDITS_BACK, STAMP
 from mapstream.graph.order import NUM_FRAMES, Order, Outcome
 from mapstream.graph.packing import pack, unpack
 from mapstream.graph.pipe import Frame, Pipe
@@ -203,7 +203,7 @@ class RemoteStage(Stage):
         receiver.close()
 
     async def _deliver(self, number: int, delivery: _Delivery) -> None:
-        sender = delivery.sender
+        sender, num_taken = delivery.sender, 0
         while True:
             while not delivery.queue:
                 await delivery.filled.wait()
@@ -212,7 +212,8 @@ class RemoteStage(Stage):
                 case Frame.MESSAGE:
                     await sender.send(value)
                     del value  # so that its memory in the ring is free while this waits
-                    if self._pipe is not None:
+                    num_taken += 1
+                    if self._pipe is not None and num_taken % (CREDITS_BACK // 2) == 0:
                         self._pipe.send(Frame.CREDIT, number, lazily=True)
                 case Frame.BOUND:
                     sender.advance(value)

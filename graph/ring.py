@@ -14,9 +14,10 @@ import os
 import sys
 import tempfile
 import weakref
+from bisect import insort
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -43,8 +44,7 @@ def _notes(memory: mmap.mmap) -> npt.NDArray[np.int64]:
     return np.frombuffer(memory, np.int64, _NUM_NOTES, offset=_NUM_REGIONS)
 
 
-@dataclass(frozen=True, slots=True)
-class Span:
+class Span(NamedTuple):
     """Where one array lies."""
 
     start: int
@@ -52,11 +52,10 @@ class Span:
     is_read_only: bool
 
 
-@dataclass(frozen=True, slots=True)
-class Region:
+class Region(NamedTuple):
     """Where the arrays of one message lie."""
 
-    index: int
+    number: int
     spans: tuple[Span, ...]
 
 
@@ -78,21 +77,22 @@ class RingWriter:
 
     def write(self, buffers: Sequence[memoryview]) -> Region | None:
         """Copy the buffers into a free region; None if none is large enough now."""
-        self._taken = [region for region in self._taken if self._memory[region[2]]]
+        memory = self._memory
+        self._taken = [region for region in self._taken if memory[region[2]]]
         size = sum(_aligned(buffer.nbytes) for buffer in buffers)
         start = self._gap(size)
         if start is None or len(self._taken) == _NUM_REGIONS:
             return None
         used = {index for _, _, index in self._taken}
         index = next(i for i in range(_NUM_REGIONS) if i not in used)
-        self._taken.append((start, start + size, index))
-        self._taken.sort()
+        insort(self._taken, (start, start + size, index))
         spans = []
         for buffer in buffers:
-            self._memory[start : start + buffer.nbytes] = buffer
-            spans.append(Span(start, buffer.nbytes, buffer.readonly))
-            start += _aligned(buffer.nbytes)
-        self._memory[index] = 1
+            num_bytes = buffer.nbytes
+            memory[start : start + num_bytes] = buffer
+            spans.append(Span(start, num_bytes, buffer.readonly))
+            start += _aligned(num_bytes)
+        memory[index] = 1
         return Region(index, tuple(spans))
 
     def noted(self, port: int) -> int | None:
@@ -130,11 +130,11 @@ class RingReader:
         whole = self._memory[start : start + size]
         if self._num_bytes_held + size > self._memory.nbytes // 2:
             whole = whole.copy()
-            self._memory[region.index] = 0
+            self._memory[region.number] = 0
         else:
             self._num_bytes_held += size
-            forget = partial(self._free, region.index, size)
-            self._held[region.index] = weakref.ref(whole, forget)
+            forget = partial(self._free, region.number, size)
+            self._held[region.number] = weakref.ref(whole, forget)
         view = memoryview(whole)  # type: ignore[arg-type]  # typeshed: a buffer only from Python 3.12
         parts = [view[span.start - start : span.start - start + span.size] for span in region.spans]
         return [

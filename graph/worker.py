@@ -23,7 +23,7 @@ from typing import Any
 import anyio
 import anyio.lowlevel
 
-from mapstream.graph.crossing import ARRIVAL, STAMP, Inlet, Outlet, ParentClock
+from mapstream.graph.crossing import ARRIVAL, CREDITS_BACK, STAMP, Inlet, Outlet, ParentClock
 from mapstream.graph.metrics import resident_bytes
 from mapstream.graph.order import NUM_FRAMES, Order, Outcome
 from mapstream.graph.packing import unpack
@@ -132,7 +132,7 @@ class _Worker:
                 message = unpack(body[ARRIVAL.size :], self._reader)
                 self._inlets[port].deliver(message, ARRIVAL.unpack_from(body))
             case Frame.CREDIT:
-                self._outlets[port].add_credit()
+                self._outlets[port].add_credits(CREDITS_BACK // 2)
             case Frame.BOUND:
                 self._inlets[port].advance(*STAMP.unpack(body))
             case Frame.EPOCH:
