@@ -222,9 +222,15 @@ def rpe(
             then may miss delta by a tenth.
 
     Raises:
-        EstimationError: If the trajectory is shorter than delta.
+        EstimationError: If the trajectory is shorter than delta, or delta is no such length.
     """
-    i, j = (_pairs_by_frames if unit == "frames" else _pairs_by_path)(pairs, delta, all_pairs)
+    if delta <= 0 or (unit == "frames" and delta != int(delta)):
+        raise EstimationError(
+            f"relative errors over {delta:g} {unit}: give metres, or whole frames"
+        )
+    i, j = (_pairs_by_frames if unit == "frames" else _pairs_by_path)(
+        pairs, delta, all_pairs=all_pairs
+    )
     if not len(i):
         raise EstimationError(f"the trajectory is too short for motions over {delta:g} {unit}")
     motion = invert(pairs.estimate[i]) @ pairs.estimate[j]
@@ -232,13 +238,15 @@ def rpe(
     return _errors(pairs.stamps_ns[j], invert(reference) @ motion)
 
 
-def _pairs_by_frames(pairs: PosePairs, delta: float, all_pairs: bool) -> tuple[IntArray, IntArray]:  # noqa: FBT001
+def _pairs_by_frames(
+    pairs: PosePairs, delta: float, *, all_pairs: bool
+) -> tuple[IntArray, IntArray]:
     step = int(delta)
     starts = np.arange(0, len(pairs) - step, 1 if all_pairs else step)
     return starts, starts + step
 
 
-def _pairs_by_path(pairs: PosePairs, delta: float, all_pairs: bool) -> tuple[IntArray, IntArray]:  # noqa: FBT001
+def _pairs_by_path(pairs: PosePairs, delta: float, *, all_pairs: bool) -> tuple[IntArray, IntArray]:
     path_m = _path(pairs.reference)
     if all_pairs:
         ends = [_closest(path_m, k, delta) for k in range(len(path_m) - 1)]

@@ -9,10 +9,11 @@ from pathlib import Path
 from mapstream.recordings.datasets.conversion import Convert, Notices, Progress
 from mapstream.recordings.datasets.kitti import convert_kitti
 from mapstream.recordings.datasets.lidar_bins import convert_lidar_bins
+from mapstream.recordings.mcap_whole import whole_mcap
 from mapstream.recordings.mcap_writer import McapWriter
 from mapstream.recordings.recording import open_recording
 from mapstream.recordings.trajectory_files import read_tum
-from mapstream.streams.errors import ConfigError, RecordingError
+from mapstream.streams.errors import ConfigError
 from mapstream.streams.geometry import SE3
 from mapstream.streams.messages.estimates import Odometry
 
@@ -83,13 +84,6 @@ def convert(
     source, out = Path(place), Path(out)
     if not source.exists():
         raise ConfigError(f"{spec}: there is nothing at {source}")
-    part = out.with_name(out.name + ".part")
-    try:
-        with McapWriter(part) as writer:
-            notices = CONVERTERS[kind].convert(source, writer, on_progress or (lambda _: None))
-        part.replace(out)
-    except OSError as error:
-        raise RecordingError(f"{out}: cannot be written: {error}") from error
-    finally:
-        part.unlink(missing_ok=True)
+    with whole_mcap(out) as writer:
+        notices = CONVERTERS[kind].convert(source, writer, on_progress or (lambda _: None))
     return Conversion(out, writer.num_messages, notices)

@@ -9,7 +9,7 @@ from typing import Any
 
 from pydantic import BaseModel, ValidationError
 
-from mapstream.recordings.mcap_writer import McapWriter
+from mapstream.recordings.mcap_whole import whole_mcap
 from mapstream.recordings.worlds.simulation import Simulation
 from mapstream.recordings.worlds.w_lid import WLidConfig, w_lid
 from mapstream.streams.errors import ConfigError
@@ -39,6 +39,8 @@ def simulate(
 ) -> Path:
     """Write a synthetic recording as MCAP; the same name, seed and options give the same bytes.
 
+    The file is there whole or not at all.
+
     Args:
         name: A key of `WORLDS`.
         path: The file to write; one that exists is replaced.
@@ -62,7 +64,7 @@ def simulate(
         raise ConfigError(f"{name}.{key}: {first['msg']}; options are {known}") from error
     simulation = world.simulate(config, seed)
     span_ns = simulation.end_ns - simulation.start_ns
-    with McapWriter(path) as writer:
+    with whole_mcap(path) as writer:
         for record in simulation.records:
             writer.write(record.topic, record.message, record.log_ns)
             if on_progress is not None:

@@ -167,5 +167,7 @@ def test_too_short_for_the_metric() -> None:
 
     with pytest.raises(EstimationError, match="too short for motions over 10 frames"):
         rpe(pairs, delta=10)
+    with pytest.raises(EstimationError, match=r"over 0\.5 frames: give metres, or whole frames"):
+        rpe(pairs, delta=0.5)
     with pytest.raises(EstimationError, match=r"segments of 100 m; the reference is 5\.0 m long"):
         kitti_drift(pairs)

@@ -224,3 +224,16 @@ def test_R9_the_world_is_made_within_a_minute(tmp_path: Path) -> None:
 
     seconds = (time.process_time() - started) * num_sweeps / 40 / 2  # two cores
     assert seconds < 60
+
+
+def test_an_interrupted_simulation_leaves_no_file(tmp_path: Path) -> None:
+    """Half a world is no world."""
+
+    def stop(fraction: float) -> None:
+        if fraction > 0.1:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        simulate("w_lid", tmp_path / "w.mcap", on_progress=stop, **SMALL)
+
+    assert list(tmp_path.iterdir()) == []
