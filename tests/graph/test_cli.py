@@ -2,53 +2,18 @@
 
 from __future__ import annotations
 
-import json
 import subprocess
 import sys
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import pytest
 
-from mapstream.graph.cli import VERBS, main
+from mapstream.graph.cli import VERBS
 from mapstream.operators.samples import samples
 from mapstream.recordings.maps import Map, save_map
 from mapstream.recordings.maps.build import append_submap
 from mapstream.streams.messages.estimates import Submap
-
-
-@dataclass(frozen=True)
-class Done:
-    code: int
-    out: str
-    err: str
-
-    @property
-    def json(self) -> Any:  # noqa: ANN401  # whatever the verb tells
-        return json.loads(self.out)
-
-
-class Terminal:
-    def __init__(self, capsys: pytest.CaptureFixture[str]) -> None:
-        self._capsys = capsys
-
-    def __call__(self, *words: object) -> Done:
-        with pytest.raises(SystemExit) as caught:
-            main([str(word) for word in words])
-        out, err = self._capsys.readouterr()
-        return Done(int(caught.value.code or 0), out, err)
-
-
-@pytest.fixture
-def mapstream(
-    capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> Terminal:
-    """The command line, in a folder of its own."""
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.delenv("MAPSTREAM_TRACEBACK", raising=False)
-    return Terminal(capsys)
-
+from tests.graph.terminal import Terminal
 
 GRAPH = """\
 version: 1
