@@ -135,6 +135,9 @@ class Receiver(Generic[T_co]):
                     channel.senders.wake()
                 message: T_co = entry[0]
                 return message
+            if not items and not channel.is_closed:
+                await channel.readers.wait()
+                continue
             found = self.try_receive()
             if found is not None:
                 return found

@@ -65,7 +65,7 @@ class TestClock:
         self._deadlines_ns.append(stamp_ns)
         try:
             while self._now_ns < stamp_ns:
-                await Waiters.wait_any([self._moved])
+                await self._moved.wait()
         finally:
             self._deadlines_ns.remove(stamp_ns)
 

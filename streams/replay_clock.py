@@ -212,7 +212,7 @@ class ReplayClock:
 
     async def _wait(self, stamp_ns: int) -> None:
         if self._is_paused:
-            await Waiters.wait_any([self._changed])
+            await self._changed.wait()
             return
         left_s = (stamp_ns - self.now_ns()) / 1e9 / (self._rate or 1.0)
         if self._auto is not None:

@@ -1,9 +1,8 @@
-"""Waiting for one of several things, on one event loop."""
+"""Waiting on one event loop."""
 
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Iterable
 
 
 class Waiters(list["asyncio.Future[None]"]):
@@ -24,20 +23,7 @@ class Waiters(list["asyncio.Future[None]"]):
         self.append(future)
         try:
             await future
-        finally:
-            if future in self:  # cancelled
+        except asyncio.CancelledError:
+            if future in self:
                 self.remove(future)
-
-    @staticmethod
-    async def wait_any(several: Iterable[Waiters]) -> None:
-        """Wait until any of these is woken."""
-        future = asyncio.get_running_loop().create_future()
-        queues = list(several)
-        for queue in queues:
-            queue.append(future)
-        try:
-            await future
-        finally:
-            for queue in queues:
-                if future in queue:
-                    queue.remove(future)
+            raise
