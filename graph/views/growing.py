@@ -36,7 +36,7 @@ def redraw_mission(
     scene.corrected[mission_id] = stamps_ns, positions
     scene.driven = {ns: p for ns, p in scene.driven.items() if ns > stamps_ns[-1]}
     color = mission_color(scene.mission_number(mission_id))
-    line = rr.LineStrips3D([positions], colors=color, radii=LINE)
+    line = rr.LineStrips3D(positions[None].astype(np.float32), colors=color, radii=LINE)
     drawing = [Entry.of(f"{MAP_PATH}/trajectory/{mission_id[:8]}", line)]
     rows = {(mission_id, int(stamp_ns)): row for row, stamp_ns in enumerate(stamps_ns)}
     for path, (vertex, T_before) in scene.submaps.items():

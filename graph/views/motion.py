@@ -82,14 +82,14 @@ def view_transforms(batch: TransformBatch, scene: Scene) -> Drawing:  # noqa: AR
 def _motion(stamp_ns: int, T_odom_base: SE3, scene: Scene) -> list[Entry | Columns]:
     """Return where odometry alone would have gone, and if it moves the robot, the robot."""
     path, points = scene.line("uncorrected", T_odom_base.t)
-    line = rr.LineStrips3D([points], colors=DRIVEN, radii=rr.Radius.ui_points(1.0))
+    line = rr.LineStrips3D(points[None], colors=DRIVEN, radii=rr.Radius.ui_points(1.0))
     drawing: list[Entry | Columns] = [Entry.of(path, line)]
     if not scene.is_main():
         return drawing
     drawing.append(placed(BASE, ODOM, T_odom_base))
     scene.driven[stamp_ns] = T_odom_base.t
-    newest = list(islice(reversed(scene.driven.values()), _TRAIL_LENGTH))
-    trail = rr.LineStrips3D([newest], colors=ROBOT, radii=rr.Radius.ui_points(1.5))
+    newest = np.array([*islice(reversed(scene.driven.values()), _TRAIL_LENGTH)], dtype=np.float32)
+    trail = rr.LineStrips3D(newest[None], colors=ROBOT, radii=rr.Radius.ui_points(1.5))
     drawing += scene.within("trail", ODOM, trail)
     if scene.once("robot"):
         body = rr.Boxes3D(half_sizes=[0.5, 0.3, 0.2], colors=ROBOT, fill_mode="solid")

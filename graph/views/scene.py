@@ -17,7 +17,7 @@ import numpy.typing as npt
 import rerun as rr
 
 from mapstream.streams.geometry import SE3
-from mapstream.streams.messages.sensors import FloatArray, IntArray
+from mapstream.streams.messages.sensors import Float32Array, FloatArray, IntArray
 
 Vertex = tuple[str, int]  # mission, stamp
 MAP, ODOM, BASE = (
@@ -120,8 +120,8 @@ class Scene:
             self.missions.append(mission_id)
         return self.missions.index(mission_id)
 
-    def line(self, name: str, position: FloatArray) -> tuple[str, FloatArray]:
-        """Add a position (3,) to a line; return the path and the points (N, 3) of its last stretch.
+    def line(self, name: str, position: FloatArray) -> tuple[str, Float32Array]:
+        """Add a position (3,) to a line; return the path and the points (N, 3), float32, of its last stretch.
 
         Stretches are short, so that a long line is not logged whole with each message.
         """
@@ -131,7 +131,7 @@ class Scene:
             number, points = number + 1, points[-1:]
         points = [*points, position]
         self._lines[slot] = number, points
-        return f"{name}/{number}", np.array(points)
+        return f"{name}/{number}", np.array(points, dtype=np.float32)
 
     def start_epoch(self) -> list[Entry]:
         """Forget where the robot was; return the entries that wipe the lines of this output."""
@@ -175,10 +175,9 @@ def transform(
     T_parent_child: SE3, parent_frame: str | None = None, child_frame: str | None = None
 ) -> rr.Transform3D:
     """Return Rerun's form of a transform, of an entity or between named frames."""
-    quaternion = rr.Quaternion(xyzw=T_parent_child.quat_xyzw)
     return rr.Transform3D(
         translation=T_parent_child.t,
-        quaternion=quaternion,
+        mat3x3=T_parent_child.R,  # a quaternion takes longer to compute than all else here
         parent_frame=parent_frame,
         child_frame=child_frame,
     )

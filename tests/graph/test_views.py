@@ -48,7 +48,7 @@ SENSORS = {
     "imu": {"/op/port/gyro": "Scalars:scalars", "/op/port/accel": "Scalars:scalars"},
     "laser": {"/op/port": "Points3D:positions"},
     "gnss": {"/op/port": "GeoPoints:positions"},
-    "wheels": {"/frames/base": "Transform3D:quaternion"},
+    "wheels": {"/frames/base": "Transform3D:mat3x3"},
     "tf": {"/op/port/os_lidar": "Transform3D:parent_frame"},
     "features": {"/op/port": "Points2D:positions"},
 }
