@@ -11,12 +11,12 @@ import rerun as rr
 
 from mapstream.graph.views.colors import mission_color, switch_colors
 from mapstream.graph.views.scene import Entry, Scene, Vertex, transform
-from mapstream.streams.geometry import SE3, invert, se3_log
+from mapstream.streams.geometry import SE3
 from mapstream.streams.messages.sensors import FloatArray, IntArray
 
 MAP_PATH = "/map"
 LINE = rr.Radius.ui_points(3.5)
-_MOVED = 0.005  # [m, rad]: a submap that moved less is left where it is
+_MOVED = 0.005  # [m], and about [rad]: a submap that moved less is left where it is
 
 
 def redraw_mission(
@@ -43,7 +43,7 @@ def redraw_mission(
         row = rows.get(vertex)
         if row is None:
             continue
-        if np.abs(se3_log(invert(T_before.matrix) @ T_map_base[row])).max() > _MOVED:
+        if np.abs(T_before.matrix - T_map_base[row]).max() > _MOVED:
             T_now = SE3(T_map_base[row])
             scene.submaps[path] = vertex, T_now
             drawing.append(Entry.of(path, transform(T_now)))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import rerun as rr
 
@@ -11,7 +13,13 @@ from mapstream.graph.views.growing import MAP_PATH, redraw_loops, redraw_mission
 from mapstream.graph.views.lidar import height_colors, thinned
 from mapstream.graph.views.scene import MAP, ODOM, Columns, Drawing, Entry, Scene, placed, transform
 from mapstream.streams.geometry import SE3
-from mapstream.streams.messages.estimates import Keyframe, LoopReport, MapCorrection, Submap
+from mapstream.streams.messages.estimates import (
+    Keyframe,
+    LoopCandidate,
+    LoopReport,
+    MapCorrection,
+    Submap,
+)
 from mapstream.streams.messages.sensors import Float32Array
 
 _CLOUD_SIZE = rr.Radius.ui_points(1.2)
@@ -63,17 +71,18 @@ def view_loop_report(report: LoopReport, scene: Scene) -> Drawing:
     pairs = [pair for pair in found if pair is not None]
     lines = np.array(pairs, dtype=np.float32).reshape(-1, 2, 3)
     drawing.append(Entry.of("refused", rr.LineStrips3D(lines, colors=REFUSED, radii=_THIN)))
-    for candidate in report.candidates:
-        is_accepted = candidate.verdict == "accepted"
-        span_s = (candidate.stamp_b_ns - candidate.stamp_a_ns) / 1e9
-        text = (
-            f"{candidate.verdict}: {abs(span_s):.1f} s apart, {candidate.distance_m:.1f} m away, "
-            f"inliers {candidate.inlier_fraction:.0%}, rmse {candidate.rmse_m:.3f} m"
-        )
-        color = ACCEPTED if is_accepted else REFUSED | 0xFF
-        level = rr.TextLogLevel.INFO if is_accepted else rr.TextLogLevel.DEBUG
-        drawing.append(Entry.of("log", rr.TextLog(text, level=level, color=color)))
-    return drawing
+    return [*drawing, *map(_said, report.candidates)]
+
+
+def _said(candidate: LoopCandidate) -> Entry:
+    """Return the line of the log that says what became of a candidate."""
+    span_s = abs(candidate.stamp_b_ns - candidate.stamp_a_ns) / 1e9
+    text = f"{candidate.verdict}: {span_s:.1f} s apart, {candidate.distance_m:.1f} m away"
+    if math.isfinite(candidate.rmse_m):  # else it was not even registered
+        text += f", inliers {candidate.inlier_fraction:.0%}, rmse {candidate.rmse_m:.3f} m"
+    if candidate.verdict == "accepted":
+        return Entry.of("log", rr.TextLog(text, level=rr.TextLogLevel.INFO, color=ACCEPTED))
+    return Entry.of("log", rr.TextLog(text, level=rr.TextLogLevel.DEBUG, color=REFUSED | 0xFF))
 
 
 def view_map_correction(correction: MapCorrection, scene: Scene) -> Drawing:
