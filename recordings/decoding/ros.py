@@ -6,6 +6,7 @@ The definitions are those of sensor_msgs, nav_msgs, geometry_msgs and tf2_msgs, 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import cache
 
 import numpy as np
 
@@ -23,6 +24,7 @@ from mapstream.streams.messages.sensors import (
 
 _IMU_NUMBERS = 37  # orientation 4 + 9, gyro 3 + 9, accelerometer 3 + 9
 _GYRO, _ACCEL = slice(13, 16), slice(25, 28)
+_STAMP = slice(4, 12)  # of a message of ROS 2 [bytes]
 _ROTATION_FIRST = np.array([3, 4, 5, 0, 1, 2])  # ROS writes the translation first
 
 
@@ -41,7 +43,7 @@ def imu(cursor: CdrCursor) -> ImuBatch:
 
 
 def imu_batch(payloads: Sequence[memoryview]) -> ImuBatch:
-    """Read many sensor_msgs/Imu of ROS 2 at once: 0.2 us each instead of 10.
+    """Read many sensor_msgs/Imu of ROS 2 at once, for a tenth of the time.
 
     Raises:
         ValueError: If they are not of one length and frame, or not little-endian CDR.
@@ -49,24 +51,36 @@ def imu_batch(payloads: Sequence[memoryview]) -> ImuBatch:
     size = len(payloads[0])
     if any(len(payload) != size for payload in payloads):
         raise ValueError("IMU messages of different lengths in one batch")
-    rows = np.frombuffer(b"".join(payloads), np.uint8).reshape(len(payloads), size)
     cursor = CdrCursor(payloads[0])
     _, frame = cursor.header()
-    if (rows[:, 12 : cursor.position] != rows[0, 12 : cursor.position]).any():
-        raise ValueError("IMU messages of different frames in one batch")
-    if (rows[:, :2] != (0, 1)).any():
-        raise ValueError("an IMU message that is not little-endian CDR")
-    start = cursor.position
     cursor.array("<f8", _IMU_NUMBERS)
     cursor.end()
     start = cursor.position - 8 * _IMU_NUMBERS
-    times = rows[:, 4:12].copy().view("<u4").astype(np.int64)
-    values = rows[:, start : cursor.position].copy().view("<f8")
+    joined = b"".join(payloads)
+    heads = np.frombuffer(joined, np.uint8).reshape(len(payloads), size)[:, :start]
+    differs = heads != heads[0]
+    differs[:, _STAMP] = False
+    if differs.any():
+        raise ValueError("IMU messages of different frames or encodings in one batch")
+    rows = np.frombuffer(joined, _imu_rows(size, start))
     return ImuBatch(
-        stamps_ns=times[:, 0] * 10**9 + times[:, 1],
-        gyro_radps=values[:, _GYRO],
-        accel_mps2=values[:, _ACCEL],
+        stamps_ns=rows["seconds"].astype(np.int64) * 10**9 + rows["nanoseconds"],
+        gyro_radps=rows["gyro"],
+        accel_mps2=rows["accel"],
         frame=frame or "imu",
+    )
+
+
+@cache
+def _imu_rows(size: int, start: int) -> np.dtype[np.void]:
+    """Return the layout of an Imu message whose numbers begin at a byte."""
+    return np.dtype(
+        {
+            "names": ["seconds", "nanoseconds", "gyro", "accel"],
+            "formats": ["<u4", "<u4", ("<f8", 3), ("<f8", 3)],
+            "offsets": [4, 8, start + 8 * _GYRO.start, start + 8 * _ACCEL.start],
+            "itemsize": size,
+        }
     )
 
 
