@@ -33,6 +33,7 @@ class Anchored(Join[tuple[Any, ...]]):
         super().__init__([anchor, *connected])
         ports = iter(self.ports)
         self._anchor = next(ports)
+        self._leading = [self._anchor]
         self._takes = [(take, None if take.receiver is None else next(ports)) for take in takes]
         self._interval = interval
         self._head: Any = None  # the anchor that `_extent` is of

@@ -108,7 +108,13 @@ class Port(Generic[M]):
                 return False
         return True
 
+    def start_epoch(self) -> None:
+        """Forget what is held: time starts anew."""
+        self.held.clear()
+        self.last_ns = BEGINNING
+
     def forget_before(self, index: int) -> None:
+        """Drop messages from the front, up to one that is still wanted."""
         if index > 0:
             del self.held[:index]
 
@@ -125,6 +131,7 @@ class Join(ABC, Generic[T]):
             raise ValueError("a join needs at least one receiver")
         self.stats = JoinStats()
         self.ports = [Port(receiver, i, self.stats) for i, receiver in enumerate(receivers)]
+        self._leading = self.ports  # the join goes on while one of these does
 
     @abstractmethod
     def _decide(self) -> T | Port[Any] | None:
@@ -145,13 +152,18 @@ class Join(ABC, Generic[T]):
             elif found is not None:
                 self.stats.matched += 1
                 return found
-            elif not self._enter_next_epoch():
+            elif not await self._enter_next_epoch():
                 raise StopAsyncIteration
 
-    def _enter_next_epoch(self) -> bool:
-        if not all(p.receiver.spans_epochs and p.receiver.is_at_epoch_end for p in self.ports):
+    async def _enter_next_epoch(self) -> bool:
+        """Read all ports up to their marks and step over them; False if no leading port has one."""
+        if not any(p.receiver.is_at_epoch_end and not p.receiver.has_ended for p in self._leading):
             return False
         for port in self.ports:
-            port.held.clear()
-        num_crossed = sum(port.receiver.cross_epoch() for port in self.ports)  # each of them
-        return num_crossed > 0
+            while not port.receiver.is_at_epoch_end:
+                if not port.pull():
+                    await port.receiver.wait()
+                port.held.clear()
+            port.receiver.cross_epoch()
+            port.start_epoch()
+        return True

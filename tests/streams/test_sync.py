@@ -292,6 +292,25 @@ async def test_epochs_never_mix_where_a_join_spans_them() -> None:
 
 
 @pytest.mark.anyio
+async def test_an_anchored_join_leaves_the_rest_of_an_epoch_behind() -> None:
+    channels = [Channel[Tick](f"p{i}", Limits(capacity=100)) for i in range(2)]
+    anchors, others = channels
+    for stamps_ns in ((5, 6), (1, 2)):
+        for stamp_ns in stamps_ns:
+            await anchors.put(Tick(stamp_ns))
+        for stamp_ns in (*stamps_ns, 90, 91):  # more than the anchors need
+            await others.put(Tick(stamp_ns))
+        for channel in channels:
+            channel.start_epoch()
+    anchors.close()
+    await others.put(Tick(3))  # and no end: the join does not wait for it
+
+    a, b = (Receiver(channel, spans_epochs=True) for channel in channels)
+    with anyio.fail_after(5):
+        assert await _stamps(anchored(a, latest(b))) == [(5, 5), (6, 6), (1, 1), (2, 2)]
+
+
+@pytest.mark.anyio
 async def test_a_join_ends_with_the_epoch_where_the_operator_does_not_span_them() -> None:
     channel: Channel[Tick] = Channel()
     await channel.put(Tick(5))
