@@ -13,7 +13,11 @@ import numpy as np
 from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt
 
 from mapstream.operators.lidar.deskew import deskew_along, deskew_by_velocity
-from mapstream.operators.lidar.registration import RegistrationResult, make_registration
+from mapstream.operators.lidar.registration import (
+    Registration,
+    RegistrationResult,
+    make_registration,
+)
 from mapstream.operators.odometry.gyro import GyroWindow, turning
 from mapstream.operators.odometry.local_map import LocalMap
 from mapstream.operators.odometry.resolution import Resolution
@@ -27,6 +31,8 @@ from mapstream.streams.geometry import SE3
 from mapstream.streams.messages.estimates import Odometry, PointCloud
 from mapstream.streams.messages.sensors import FloatArray, ImuBatch, LidarScan
 from mapstream.streams.trajectory import Trajectory
+
+_BEND_LIMIT_M = 0.02  # about the noise of a range
 
 
 class GicpOdometryConfig(OperatorConfig):
@@ -105,9 +111,10 @@ class GicpOdometry(Operator[Inputs, Outputs]):
         result = None
         try:
             result = self._align(points, step, step_ns)
-            if motion is None and sweep.offsets_ns is not None and step_ns > 0:
+            measured = self._T_odom_base.inverse() @ result.T_target_source
+            if self._is_bent(sweep, step, measured, motion):
                 # the prediction removed most of the distortion, what was measured removes the rest
-                step = self._T_odom_base.inverse() @ result.T_target_source
+                step = measured
                 points = self._deskewed(sweep, step, step_ns, None)
                 result = self._align(points, step, step_ns)
         except EstimationError as error:
@@ -120,6 +127,15 @@ class GicpOdometry(Operator[Inputs, Outputs]):
         if motion is not None and step_ns > 0:
             return motion.between(end_ns - step_ns, end_ns)
         return SE3.exp(self._velocity * (step_ns / 1e9))
+
+    def _is_bent(self, sweep: Sweep, step: SE3, measured: SE3, motion: Trajectory | None) -> bool:
+        """Return whether deskewing by this step, not by the measured one, has left a distortion that counts."""
+        if motion is not None or sweep.offsets_ns is None or self._last_ns is None:
+            return False
+        difference = step.inverse() @ measured
+        reach_m = float(np.median(np.linalg.norm(sweep.points, axis=1)))
+        bend_m = float(np.linalg.norm(difference.t)) + difference.angle_rad * reach_m
+        return bend_m > _BEND_LIMIT_M
 
     def _deskewed(
         self, sweep: Sweep, step: SE3, step_ns: int, motion: Trajectory | None
@@ -190,18 +206,18 @@ class GicpOdometry(Operator[Inputs, Outputs]):
 
 
 def _matcher(config: GicpOdometryConfig, voxel_size_m: float) -> ScanMatcher:
-    def options(factor: float) -> dict[str, Any]:
-        """Return small_gicp's options at a resolution; an installed registration has its own."""
-        if config.registration_options:
-            return config.registration_options
-        return {
+    def registration(factor: float, distances_m: tuple[float, ...]) -> Registration:
+        """Make one at a resolution; an installed registration has its own options."""
+        options = config.registration_options or {
             "leaf_size_m": factor * voxel_size_m,
-            "search_distances_m": tuple(factor * d for d in config.search_distances_m),
+            "search_distances_m": tuple(factor * d for d in distances_m),
             "inlier_distance_m": factor * config.inlier_distance_m,
         }
+        return make_registration(config.registration, **options)
 
     return ScanMatcher(
-        fine=make_registration(config.registration, **options(1.0)),
-        coarse=make_registration(config.registration, **options(3.0)),
+        near=registration(1.0, config.search_distances_m[-1:]),
+        far=registration(1.0, config.search_distances_m),
+        coarse=registration(3.0, config.search_distances_m),
         min_inlier_fraction=config.min_inlier_fraction,
     )

@@ -58,6 +58,16 @@ class Outputs:
     clouds: Sender[PointCloud]
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Tracked:
+    """One scan after tracking."""
+
+    odometry: Odometry
+    sweep: Sweep
+    step: SE3  # of the sensor, since the scan before
+    step_ns: int  # zero for the first
+
+
 class KissOdometry(Operator[Inputs, Outputs]):
     """Track a LiDAR against a local voxel map, assuming constant velocity.
 
@@ -80,13 +90,13 @@ class KissOdometry(Operator[Inputs, Outputs]):
 
     async def run(self, inputs: Inputs, outputs: Outputs) -> None:
         async for scan in inputs.scans:
-            odometry, sweep, step = await offload(self.register, scan)
-            await outputs.odometry.send(odometry)
-            if outputs.clouds.channels:
-                await outputs.clouds.send(await offload(self.cloud, sweep, step))
+            tracked = await offload(self.register, scan)
+            await outputs.odometry.send(tracked.odometry)
+            if outputs.clouds.is_connected:
+                await outputs.clouds.send(await offload(self.cloud, tracked))
 
-    def register(self, scan: LidarScan) -> tuple[Odometry, Sweep, SE3]:
-        """Align one scan; return its pose, its points, and the sensor's step since the scan before."""
+    def register(self, scan: LidarScan) -> Tracked:
+        """Align one scan."""
         sweep = Sweep.of(scan)
         tracker = self._tracker or KissTracker(self._kiss_config(sweep.points), self._limits())
         step_ns = sweep.end_ns - self._last_ns if tracker.has_map else 0
@@ -112,14 +122,14 @@ class KissOdometry(Operator[Inputs, Outputs]):
             covariance=unmeasured(step_ns / 1e9) if is_lost else covariance,
             is_lost=is_lost,
         )
-        return odometry, sweep, before.inverse() @ tracker.pose
+        return Tracked(odometry, sweep, before.inverse() @ tracker.pose, step_ns)
 
-    def cloud(self, sweep: Sweep, step: SE3) -> PointCloud:
+    def cloud(self, tracked: Tracked) -> PointCloud:
         """Deskew by the motion that was measured, not by the one before it, on which KISS-ICP relies."""
-        config, points = self._config, sweep.points
-        if config.deskew and sweep.offsets_ns is not None:
-            sweep_ns = sweep.end_ns - sweep.start_ns
-            points = deskew_by_velocity(points, sweep.offsets_ns, step, sweep_ns)
+        config, sweep = self._config, tracked.sweep
+        points = sweep.points
+        if config.deskew and sweep.offsets_ns is not None and tracked.step_ns > 0:
+            points = deskew_by_velocity(points, sweep.offsets_ns, tracked.step, tracked.step_ns)
         keep = usable(points, config.min_range_m, config.max_range_m)
         return sweep.cloud(sweep.T_base_sensor @ points, config.cloud_voxel_size_m, keep)
 

@@ -12,19 +12,26 @@ from mapstream.streams.geometry import SE3
 from mapstream.streams.messages.sensors import FloatArray
 
 _SEARCH_YAW_DEG = (0.0, 25.0, -25.0, 50.0, -50.0)
+_SURE_INLIER_FRACTION = 0.75  # of a good prediction, refined over a short distance
 
 
 class ScanMatcher:
     """Aligns scans to what it is given as a target, and believes only what fits.
 
     A fit is believed if enough of the scan's points lie on the target. Where the prediction gives no such
-    fit, guesses with other headings are tried at a coarse resolution, and the best of them is refined.
+    fit over a short distance, a longer one is tried; then guesses with other headings at a coarse
+    resolution, of which the best is refined.
     """
 
     def __init__(
-        self, fine: Registration, coarse: Registration, min_inlier_fraction: float
+        self,
+        *,
+        near: Registration,
+        far: Registration,
+        coarse: Registration,
+        min_inlier_fraction: float,
     ) -> None:
-        self._fine, self._coarse = fine, coarse
+        self._near, self._far, self._coarse = near, far, coarse
         self._min_inlier_fraction = min_inlier_fraction
 
     def match(
@@ -41,12 +48,15 @@ class ScanMatcher:
         Raises:
             EstimationError: If no guess leads to a fit, with the best inlier fraction that was seen.
         """
-        result = self._fine.align(points, target, T_predicted)
+        result = self._near.align(points, target, T_predicted)
+        if result.inlier_fraction >= max(_SURE_INLIER_FRACTION, self._min_inlier_fraction):
+            return result
+        result = self._far.align(points, target, T_predicted)
         if result.inlier_fraction >= self._min_inlier_fraction:
             return result
         tried = [self._coarse.align(points, target, T) for T in _guesses(T_predicted, T_last)]
         best = max(tried, key=lambda found: found.inlier_fraction)
-        refined = self._fine.align(points, target, best.T_target_source)
+        refined = self._far.align(points, target, best.T_target_source)
         if refined.inlier_fraction >= self._min_inlier_fraction:
             return refined
         most = max(result.inlier_fraction, refined.inlier_fraction)

@@ -17,7 +17,7 @@ def diagonal(sigma_rad: float, sigma_m: float) -> FloatArray:
 
 def unmeasured(duration_s: float) -> FloatArray:
     """Return the covariance (6, 6) of a step that only a motion model says (OmniMapper, section IV-D3)."""
-    return np.diag(np.square(UNMEASURED_SIGMAS)) * max(duration_s, 0.01)
+    return np.diag(np.square(UNMEASURED_SIGMAS)) * max(duration_s, 0.1)
 
 
 def chain(covariance: FloatArray, step: SE3, step_covariance: FloatArray) -> FloatArray:
