@@ -80,7 +80,7 @@ def _edges(final: Snapshot) -> Iterator[str]:
 
 
 def _events(edge: EdgeSnapshot) -> Iterator[str]:
-    yield from (f"{count} dropped ({reason})" for reason, count in edge.dropped.items())
+    yield from (f"{count} dropped ({reason})" for reason, count in edge.lost.items())
     if edge.late:
         yield f"{edge.late} late"
     if edge.grown:
