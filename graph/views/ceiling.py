@@ -7,9 +7,9 @@ from scipy.spatial import cKDTree
 
 from mapstream.streams.messages.sensors import Float32Array, FloatArray
 
-_REACH_M = 1.5  # what lies above this far around the path is overhead
+_REACH_M = 0.6  # beside the path; where the robot went there is nothing above it but a ceiling
 _HEADROOM_M = 0.4  # above the base
-_SHARE = 0.01  # of the points: less overhead is a tree, a wire, a bridge
+_COVERED = 0.5  # of the path: less is a tree, a wire, a bridge
 _SLACK_M = 0.3  # ceilings are rough
 
 
@@ -24,8 +24,8 @@ def without_ceiling(points: Float32Array, path: FloatArray) -> Float32Array:
         return points
     distance, row = cKDTree(path[:, :2]).query(points[:, :2])
     height = points[:, 2] - path[row, 2]
-    overhead = height[(distance < _REACH_M) & (height > _HEADROOM_M)]
-    if len(overhead) < _SHARE * len(points):
+    is_overhead = (distance < _REACH_M) & (height > _HEADROOM_M)
+    if len(np.unique(row[is_overhead])) <= _COVERED * len(path):
         return points
-    below: Float32Array = points[height < np.median(overhead) - _SLACK_M]
+    below: Float32Array = points[height < np.median(height[is_overhead]) - _SLACK_M]
     return below
