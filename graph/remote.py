@@ -150,7 +150,7 @@ class RemoteStage(Stage):
     async def _start(self, *descriptors: int) -> anyio.abc.Process:
         path = os.pathsep.join(entry or str(Path.cwd()) for entry in sys.path)
         return await anyio.open_process(
-            [sys.executable, "-m", "mapstream.graph.worker", *map(str, descriptors)],
+            [sys.executable, "-P", "-m", "mapstream.graph.worker", *map(str, descriptors)],
             stdin=subprocess.DEVNULL,
             stdout=2,  # what C++ prints must not mix with the output of a command
             stderr=None,

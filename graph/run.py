@@ -78,6 +78,14 @@ def clock_of(plan: Plan) -> Clock:
     return ReplayClock(None if spec.rate == "max" else spec.rate)
 
 
+def policy_of(node: Node, plan: Plan) -> OnErrorSpec:
+    """Return what happens when an operator raises: sensors drop out and come back, replays are exact."""
+    if node.on_error is not None:
+        return node.on_error
+    is_live = plan.profile.clock.from_ == "wall"
+    return OnErrorSpec(do="restart" if is_live and node.is_source else "stop")
+
+
 def _channel(edge: Edge) -> Channel[Any]:
     spool = DiskSpool(_SPOOL_BYTES) if edge.limits.policy == "spool" else None
     return Channel(edge.name, edge.limits, spool)
@@ -121,7 +129,7 @@ class _Run:
                 workers=node.workers,
                 limiter=anyio.CapacityLimiter(node.workers) if node.placement == "thread" else None,
             ),
-            policy=node.on_error or self._default_policy(node),
+            policy=policy_of(node, self._plan),
             on_failure=self._on_failure,
         )
 
@@ -130,10 +138,6 @@ class _Run:
         if self._taps or any(link.edge.is_unchecked for link in links):
             return ObservedSender(links, self._taps)
         return Sender([link.channel for link in links])
-
-    def _default_policy(self, node: Node) -> OnErrorSpec:
-        is_live = self._plan.profile.clock.from_ == "wall"
-        return OnErrorSpec(do="restart" if is_live and node.is_source else "stop")
 
     async def run_stage(self, stage: Stage) -> None:
         await stage.run()

@@ -6,6 +6,7 @@ import hashlib
 import logging
 import os
 import signal
+import threading
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -88,7 +89,7 @@ class StepConfig(OperatorConfig):
     fail_at: int = -1  # raise at the block with this value
     kill_at: int = -1  # end the process with the signal
     signal: int = signal.SIGKILL
-    sleep_at: int = -1  # wait for a signal, for good
+    sleep_at: int = -1  # never return
     gate: str = ""  # wait for this gate before each block
     log: str = ""
 
@@ -116,7 +117,7 @@ class Step(Operator[BlocksIn, BlocksOut]):
         if block.value == config.kill_at:
             os.kill(os.getpid(), config.signal)
         if block.value == config.sleep_at:
-            signal.pause()
+            threading.Event().wait()
         data = block.data * config.factor
         return Block(stamp_ns=block.stamp_ns, value=block.value * config.factor, data=data)
 

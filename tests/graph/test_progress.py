@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import io
+import json
+from pathlib import Path
 
 import pytest
 from rich.console import Console
@@ -10,6 +12,7 @@ from rich.console import Console
 from mapstream.graph.metrics import Snapshot
 from mapstream.graph.progress import ProgressBar, describe, fraction_done
 from mapstream.graph.run import run_graph
+from mapstream.graph.trace import TraceFile
 from mapstream.streams.channel import Limits
 from tests.graph.made_plans import chain, make_plan, node
 from tests.graph.operators_for_tests import COLLECTED, Collect, Source, Step
@@ -47,6 +50,20 @@ async def test_drops_are_shown() -> None:
 
     assert snapshot.num_lost > 0
     assert f"{snapshot.num_lost} dropped" in describe(snapshot)
+
+
+async def test_P7_a_trace_has_a_line_per_snapshot(tmp_path: Path) -> None:
+    plan = chain(source=node(Source, count=5), step=node(Step), sink=node(Collect))
+
+    with TraceFile(tmp_path / "trace.jsonl") as trace:
+        report = await run_graph(plan, on_progress=trace)
+    COLLECTED.clear()
+
+    lines = (tmp_path / "trace.jsonl").read_text().splitlines()
+    last = json.loads(lines[-1])
+    assert last["limiting"] == report.final.limiting
+    assert [edge["sent"] for edge in last["edges"]] == [5, 5]
+    assert last["operators"][1]["num_calls"] == 5
 
 
 @pytest.mark.parametrize("is_terminal", [True, False])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import anyio
@@ -11,8 +12,8 @@ from anyio.lowlevel import checkpoint
 
 from mapstream.graph.metrics import Snapshot
 from mapstream.graph.plan import Edge, Plan
-from mapstream.graph.run import run_graph
-from mapstream.graph.spec import OnErrorSpec
+from mapstream.graph.run import policy_of, run_graph
+from mapstream.graph.spec import PROFILES, OnErrorSpec
 from mapstream.operators.operator import Placement
 from mapstream.streams.channel import Arrival, Limits
 from tests.graph.made_plans import chain, make_plan, node
@@ -186,6 +187,15 @@ async def test_too_many_errors_stop_the_run() -> None:
 
     assert report.status == "failed"
     assert len(report.errors) == 2
+
+
+def test_a_live_source_restarts_by_default_and_all_else_stops_the_run() -> None:
+    plan = chain(source=node(Source), sink=node(Collect))
+    live = replace(plan, profile=PROFILES["live"])
+
+    assert policy_of(live.nodes["source"], live).do == "restart"
+    assert policy_of(live.nodes["sink"], live).do == "stop"
+    assert policy_of(plan.nodes["source"], plan).do == "stop"
 
 
 async def test_disable_ends_one_operator_alone() -> None:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import os
 import signal
+import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -12,7 +14,7 @@ import pytest
 
 from mapstream.graph.report import RunReport
 from mapstream.graph.run import run_graph
-from mapstream.graph.stop import Stop, on_signals
+from mapstream.graph.stop import PATIENCE_S, Stop, on_signals
 from tests.graph.made_plans import chain, node
 from tests.graph.operators_for_tests import COLLECTED, GATES, Collect, Digest, Source, Step
 
@@ -78,6 +80,48 @@ async def test_B18_a_second_request_quits_at_once() -> None:
     (report,) = reports
     assert report.status == "failed"
     assert "second request" in report.reasons[0]
+
+
+_SCRIPT = """
+import anyio
+from mapstream.graph.run import run_graph
+from mapstream.graph.stop import PATIENCE_S, Stop, on_signals
+from tests.graph.made_plans import chain, node
+from tests.graph.operators_for_tests import Collect, Source, Step
+
+async def main():
+    stop = Stop()
+    plan = chain(
+        source=node(Source, is_endless=True), step=node(Step, "thread", sleep_at=2), sink=node(Collect)
+    )
+    def told(edge, message, arrival):
+        if edge.to_node == "step" and message.value == 4:
+            print("running", flush=True)
+    async with on_signals(stop):
+        async with anyio.create_task_group() as tasks:
+            async def say():
+                await stop.wait_first()
+                print("stopping", flush=True)
+            tasks.start_soon(say)
+            await run_graph(plan, stop=stop, taps=[told])
+
+anyio.run(main)
+"""
+
+
+@pytest.mark.slow
+def test_B18_the_second_ctrl_c_quits_though_a_thread_never_returns() -> None:
+    root = Path(__file__).parents[2]
+    command = [sys.executable, "-c", _SCRIPT]
+    with subprocess.Popen(command, cwd=root, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline() == "running\n"
+        process.send_signal(signal.SIGINT)
+        assert process.stdout.readline() == "stopping\n"
+        process.send_signal(signal.SIGINT)
+        assert process.wait(timeout=30) == 1
+
+    assert PATIENCE_S < 2
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
