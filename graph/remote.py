@@ -10,17 +10,12 @@ from __future__ import annotations
 import logging
 import os
 import pickle
-import signal
 import socket
-import subprocess
-import sys
 from collections import deque
 from dataclasses import dataclass, field, fields
-from pathlib import Path
 from typing import Any
 
 import anyio
-import anyio.abc
 
 from mapstream.graph.crossing import ARRIVAL, CREDITS, CREDITS_BACK, STAMP
 from mapstream.graph.order import NUM_FRAMES, Order, Outcome
@@ -28,6 +23,7 @@ from mapstream.graph.packing import pack, unpack
 from mapstream.graph.pipe import Frame, Pipe
 from mapstream.graph.ring import RingReader, RingWriter, make_memory
 from mapstream.graph.stage import Stage
+from mapstream.graph.worker_process import cause_of, start_worker
 from mapstream.operators.operator import Activity
 from mapstream.streams.channel import BEGINNING, Receiver, Sender
 from mapstream.streams.clock import WallClock
@@ -36,9 +32,6 @@ from mapstream.streams.waiting import Waiters
 
 _RING_BYTES = 1 << 27  # of address space; memory is used as far as messages fill it
 _PATIENCE_S = 5.0  # with a process whose operator is done
-# One thread per process: the processes are the parallelism. The libraries read these when they load.
-_THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "VECLIB_MAXIMUM_THREADS")
-_ENVIRONMENT = dict.fromkeys(_THREADS, "1")
 
 
 @dataclass(slots=True)
@@ -91,7 +84,8 @@ class RemoteStage(Stage):
         """Run the operator in a new process until it is done.
 
         Raises:
-            OperatorError: If the process cannot be started, or ends before the operator does.
+            OperatorError: If the operator cannot be sent to a process.
+            ProcessDiedError: If the process ends before the operator does.
         """
         self._rest_at = -1
         self._taken: dict[str, int] = {}
@@ -106,7 +100,7 @@ class RemoteStage(Stage):
         ours, theirs = socket.socketpair()
         self._writer, self._reader = RingWriter(down), RingReader(up)
         try:
-            process = await self._start(theirs.fileno(), down, up)
+            process = await start_worker(theirs.fileno(), down, up)
         finally:
             theirs.close()
             os.close(down)
@@ -146,18 +140,6 @@ class RemoteStage(Stage):
                 f"operator {self.node.name!r} ({self.node.use}) cannot run in a process of its own: "
                 f"{error}; define it at the top of a module, or write `run: thread`"
             ) from error
-
-    async def _start(self, *descriptors: int) -> anyio.abc.Process:
-        path = os.pathsep.join(entry or str(Path.cwd()) for entry in sys.path)
-        return await anyio.open_process(
-            [sys.executable, "-P", "-m", "mapstream.graph.worker", *map(str, descriptors)],
-            stdin=subprocess.DEVNULL,
-            stdout=2,  # what C++ prints must not mix with the output of a command
-            stderr=None,
-            env=os.environ | _ENVIRONMENT | {"PYTHONPATH": path},
-            start_new_session=True,  # Ctrl-C in a terminal is for the parent alone
-            pass_fds=descriptors,
-        )
 
     async def _pump(self) -> None:
         """Feed the process and deliver what it sends, until it is done or gone."""
@@ -278,7 +260,7 @@ class RemoteStage(Stage):
         if self._broken is not None:
             raise ProcessDiedError("what its process sent cannot be read") from self._broken
         if outcome is None:
-            raise ProcessDiedError(f"its process {_cause(returncode)}")
+            raise ProcessDiedError(f"its process {cause_of(returncode)}")
         self._copy(outcome.activity)
         errors = [OperatorError(text) for text in outcome.errors]
         if errors:
@@ -290,15 +272,3 @@ class RemoteStage(Stage):
         self.errors += errors
         if outcome.state == "disabled":
             self.state = "disabled"
-
-
-def _cause(returncode: int | None) -> str:
-    if returncode is None or returncode >= 0:
-        return f"ended with code {returncode} before the operator did"
-    name = signal.Signals(-returncode).name
-    hints = {
-        "SIGKILL": "; the system may have run out of memory",
-        "SIGABRT": "; a C++ library gave up, its message is above",
-        "SIGSEGV": "; a C++ library crashed",
-    }
-    return f"was ended by {name}{hints.get(name, '')}"

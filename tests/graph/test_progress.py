@@ -15,7 +15,7 @@ from mapstream.graph.run import run_graph
 from mapstream.graph.trace import TraceFile
 from mapstream.streams.channel import Limits
 from tests.graph.made_plans import chain, make_plan, node
-from tests.graph.operators_for_tests import COLLECTED, Collect, Source, Step
+from tests.graph.operators_for_tests import Collect, Source, Step
 
 pytestmark = pytest.mark.anyio
 
@@ -24,7 +24,6 @@ async def last_snapshot() -> Snapshot:
     report = await run_graph(
         chain(source=node(Source, count=5), step=node(Step), sink=node(Collect))
     )
-    COLLECTED.clear()
     return report.final
 
 
@@ -46,7 +45,6 @@ async def test_drops_are_shown() -> None:
     )
 
     snapshot = (await run_graph(plan)).final
-    COLLECTED.clear()
 
     assert snapshot.num_lost > 0
     assert f"{snapshot.num_lost} dropped" in describe(snapshot)
@@ -57,7 +55,6 @@ async def test_P7_a_trace_has_a_line_per_snapshot(tmp_path: Path) -> None:
 
     with TraceFile(tmp_path / "trace.jsonl") as trace:
         report = await run_graph(plan, on_progress=trace)
-    COLLECTED.clear()
 
     lines = (tmp_path / "trace.jsonl").read_text().splitlines()
     last = json.loads(lines[-1])

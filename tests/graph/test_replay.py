@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 import anyio
@@ -32,12 +31,6 @@ pytestmark = pytest.mark.anyio
 
 _PERIOD_NS = 100_000_000
 _COUNT = 30
-
-
-@pytest.fixture(autouse=True)
-def _nothing_kept() -> Iterator[None]:
-    yield
-    COLLECTED.clear()
 
 
 def paced_plan() -> Plan:

@@ -6,7 +6,6 @@ import os
 import signal
 import subprocess
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 
 import anyio
@@ -16,16 +15,9 @@ from mapstream.graph.report import RunReport
 from mapstream.graph.run import run_graph
 from mapstream.graph.stop import PATIENCE_S, Stop, on_signals
 from tests.graph.made_plans import chain, node
-from tests.graph.operators_for_tests import COLLECTED, GATES, Collect, Digest, Source, Step
+from tests.graph.operators_for_tests import GATES, Collect, Digest, Source, Step
 
 pytestmark = pytest.mark.anyio
-
-
-@pytest.fixture(autouse=True)
-def _nothing_kept() -> Iterator[None]:
-    yield
-    COLLECTED.clear()
-    GATES.clear()
 
 
 async def test_B18_a_request_stops_sources_and_what_is_queued_is_finished(tmp_path: Path) -> None:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-
 import pytest
 
 from mapstream.graph.run import run_graph
@@ -21,12 +19,6 @@ from tests.graph.operators_for_tests import (
 )
 
 pytestmark = pytest.mark.anyio
-
-
-@pytest.fixture(autouse=True)
-def _nothing_kept() -> Iterator[None]:
-    yield
-    COLLECTED.clear()
 
 
 @pytest.mark.parametrize("capacity", [1, 2, 8])
