@@ -152,9 +152,14 @@ class _Survey:
         layout.segments.append(segment)
 
     def _describe(self, block: Block) -> None:
+        """Take note of the schemas and channels in a chunk, as far as each is whole."""
         for position in block.others:
             _, end = records.prefix(block.view, position, len(block.view))
-            self._layout.add(block.view, position, end)
+            try:
+                self._layout.add(block.view, position, end)
+            except DamageError as damage:
+                reason = f"a description of topics: {damage}"
+                self._layout.losses.append(Loss(offset=block.offset, reason=reason))
 
     def _describe_from_damaged(self) -> None:
         """Take descriptions that are nowhere else from damaged chunks: most files have them once."""

@@ -8,6 +8,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+import numpy as np
 from google.protobuf.message import DecodeError as ProtobufError
 
 from mapstream.recordings.recording import Channel, RawMessage
@@ -36,7 +37,8 @@ class Decoder:
             DecodeError: With topic, schema, log time and reason.
         """
         try:
-            return self.parse(raw.data)
+            with np.errstate(over="ignore", invalid="ignore"):  # absurd numbers are refused by name
+                return self.parse(raw.data)
         except _DAMAGE as error:
             raise self._error(raw, error) from error
 
