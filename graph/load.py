@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib import resources
@@ -14,14 +13,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 
 from mapstream.graph.document import Document, Positions, read_document
 from mapstream.graph.overrides import apply_sets
-from mapstream.graph.params import (
-    BUILT_IN,
-    fill_in,
-    params_used,
-    placeholder,
-    typed_value,
-    value_from_text,
-)
+from mapstream.graph.params import Given, fill_in
 from mapstream.graph.problems import GraphError, Position, Problem, did_you_mean
 from mapstream.graph.spec import PROFILES, GraphSpec, ParamSpec, ProfileSpec
 from mapstream.graph.subgraphs import Part, expand
@@ -71,7 +63,7 @@ def load_graph(
         GraphError: If it has problems: all that were found, each with file, line and key.
     """
     path = Path(graph).expanduser()
-    given = _Given(params or {}, needs_values=needs_values)
+    given = Given(params or {}, needs_values=needs_values)
     if path.suffix in (".yaml", ".yml") or path.is_file():
         return _graph(_text(path), path, given, sets, profile)
     names = preset_names()
@@ -96,10 +88,10 @@ def parse_graph(
     Raises:
         GraphError: If it has problems.
     """
-    return _graph(text, path, _Given(params or {}), sets, profile)
+    return _graph(text, path, Given(params or {}), sets, profile)
 
 
-def _graph(text: str, path: Path, given: _Given, sets: Sequence[str], profile: str) -> Graph:
+def _graph(text: str, path: Path, given: Given, sets: Sequence[str], profile: str) -> Graph:
     def read_part(file: Path, values: Mapping[str, Any]) -> Part:
         document = read_document(_text(file), _shown(file))
         return _part(document, file, dataclasses.replace(given, values=values))
@@ -143,74 +135,7 @@ class _Params(BaseModel):
     params: dict[str, ParamSpec] = {}
 
 
-@dataclass(frozen=True, slots=True)
-class _Given:
-    """The values of parameters: text from the command line, and `with:` of a sub-graph."""
-
-    texts: Mapping[str, str]
-    values: Mapping[str, Any] | None = None  # of a sub-graph, which gets no texts but the built-in
-    needs_values: bool = True
-
-    def values_of(self, specs: Mapping[str, ParamSpec], document: Document) -> dict[str, Any]:
-        """Return the values of all parameters.
-
-        Raises:
-            GraphError: If a value is missing or wrong, or belongs to no parameter.
-        """
-        used = params_used(document.data)
-        known = {name: s for name, s in BUILT_IN.items() if name in used} | dict(specs)
-        problems = self._unknown(known, document.positions.source)
-        values = {}
-        for name, spec in known.items():
-            try:
-                values[name] = self._value(name, spec)
-            except ValueError as error:
-                path = ("params", name)
-                problems.append(Problem(document.positions.of(path), path, str(error)))
-        if problems:
-            raise GraphError(problems)
-        return values
-
-    def _unknown(self, known: Mapping[str, ParamSpec], source: str) -> list[Problem]:
-        if self.values is not None:
-            given = dict.fromkeys(self.values, source)
-        else:
-            given = {name: _option(name, text) for name, text in self.texts.items()}
-        return [
-            Problem(Position(place), (), f"no parameter {name!r}{did_you_mean(name, known)}")
-            for name, place in given.items()
-            if name not in known
-        ]
-
-    def _value(self, name: str, spec: ParamSpec) -> Any:  # noqa: ANN401  # as spec says
-        if self.values is not None and name in self.values:
-            return typed_value(name, spec, self.values[name])
-        if name in self.texts and (self.values is None or name in BUILT_IN):
-            return value_from_text(name, spec, self.texts[name])
-        if spec.env is not None and spec.env in os.environ:
-            return value_from_text(name, spec, os.environ[spec.env])
-        if spec.default is not None:
-            return typed_value(name, spec, spec.default)
-        if not self.needs_values:
-            return placeholder(name, spec)
-        raise ValueError(f"no value{_how_to_give(name, spec)}")
-
-
-def _option(name: str, text: str) -> str:
-    """Return how the command line gave a parameter."""
-    ways = {"recording": f"RECORDING {text}", "map": f"--map {text}"}
-    return ways.get(name, f"--param {name}={text}")
-
-
-def _how_to_give(name: str, spec: ParamSpec) -> str:
-    ways = {"recording": "RECORDING after the graph", "map": "--map DIR"}
-    how = ways.get(name, f"--param {name}=VALUE")
-    env = f", or set {spec.env}" if spec.env else ""
-    about = f" ({spec.help})" if spec.help else ""
-    return f"; give {how}{env}{about}"
-
-
-def _part(document: Document, path: Path, given: _Given) -> Part:
+def _part(document: Document, path: Path, given: Given) -> Part:
     """Check one file and put its parameters in."""
     data, positions = document.data, document.positions
     if not isinstance(data, dict):
@@ -219,13 +144,18 @@ def _part(document: Document, path: Path, given: _Given) -> Part:
         params = _Params.model_validate(data).params
     except ValidationError as error:
         raise GraphError(problems_of(error, GraphSpec, (), positions)) from None
-    filled, problems = fill_in(document, given.values_of(params, document))
+    values, problems = given.values_of(params, document)
+    filled, unknown = fill_in(document, values)
+    problems += unknown
+    try:
+        spec = GraphSpec.model_validate(filled)
+    except ValidationError as error:
+        told = {problem.path for problem in unknown}
+        problems += [p for p in problems_of(error, GraphSpec, (), positions) if p.path not in told]
+        raise GraphError(problems) from None
     if problems:
         raise GraphError(problems)
-    try:
-        return Part(GraphSpec.model_validate(filled), positions, path)
-    except ValidationError as error:
-        raise GraphError(problems_of(error, GraphSpec, (), positions)) from None
+    return Part(spec, positions, path)
 
 
 def _profile(spec: GraphSpec, name: str) -> ProfileSpec:

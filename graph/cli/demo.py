@@ -10,7 +10,15 @@ from typing import Annotated, Any
 import typer
 
 from mapstream.graph.cli.evaluate import Score, compare
-from mapstream.graph.cli.output import ExitCode, JsonFlag, complain, in_place, say, say_json
+from mapstream.graph.cli.output import (
+    ExitCode,
+    JsonFlag,
+    complain,
+    in_place,
+    say,
+    say_aside,
+    say_json,
+)
 from mapstream.graph.cli.planning import Request, plan_request
 from mapstream.graph.cli.run_report import print_report, report_as_json
 from mapstream.graph.cli.running import execute
@@ -36,7 +44,7 @@ DEMOS = {
     "corridor": Demo(
         summary="a LiDAR in a loop of corridors",
         world="w_lid",
-        options={"length_m": 100.0, "lidar": {"beams": 16, "columns": 360}},
+        options={"length_m": 80.0, "lidar": {"columns": 360}},
     ),
 }
 
@@ -62,6 +70,8 @@ def demo(
     folder.mkdir(parents=True, exist_ok=True)
     recording, map_folder, picture = folder / "drive.mcap", folder / "map", folder / "run.rrd"
     config = WORLDS[chosen.world].config_type.model_validate(chosen.options)
+    if not json:
+        say_aside(f"simulating {chosen.summary}")
     write_world(chosen.world, recording, config, seed=seed)
     request = Request(
         graph=chosen.graph,

@@ -62,13 +62,13 @@ def run(  # noqa: PLR0913  # one for each option of the command
         say_aside(f"warning: {warning}")
     report, notes = execute(plan, rerun=rerun, has_progress=not json)
     if json:
-        say_json(report_as_json(report) | {"viewer": notes, "written": written_by(plan)})
+        say_json(report_as_json(report) | {"viewer": notes, "written": report.written})
     else:
         print_report(report)
         for note in notes:
             say_aside(f"viewer: {note}")
-        for path in written_by(plan):
-            say(f"wrote {path}")
+        for path in report.written:
+            say(f"wrote {in_place(Path(path))}")
     raise typer.Exit(report.exit_code)
 
 
@@ -97,10 +97,3 @@ def _at_rate(plan: Plan, rate: str) -> Plan:
         raise typer.BadParameter(f"expected more than 0, found {rate!r}")
     clock = plan.profile.clock.model_copy(update={"rate": value})
     return replace(plan, profile=plan.profile.model_copy(update={"clock": clock}))
-
-
-def written_by(plan: Plan) -> list[str]:
-    """Return the files and folders that the sinks of a plan write."""
-    configs = [node.config for node in plan.nodes.values() if not node.is_source]
-    paths = [getattr(config, "path", None) for config in configs]
-    return [in_place(Path(path)) for path in paths if path is not None and Path(path).exists()]

@@ -117,6 +117,12 @@ def test_stand_ins_for_missing_values_let_one_look_at_a_preset_like_graph(tmp_pa
         ("type: float", "type: flaot", "graph.yaml:5:18: params.voxel_size_m.type: should be"),
         ("default: 0.5", "default: 0.01", "expected at least 0.05 m, found 0.01"),
         ("default: 0.5", "default: big", "5:3: params.voxel_size_m: parameter 'voxel_size_m': e"),
+        ("default: 0.5", "default: .nan", "expected float, found .nan"),
+        (
+            "{scans: sensors.scans}",
+            "{scans: {from: sensors.scans, max_age_s: .inf}}",
+            "operators.odometry.in.scans.max_age_s: should be a finite number, found .inf",
+        ),
         ("type: path", "type: path, min: 3", "min and max are for int and float, not path"),
         ("run: process", "use: other", "12:5: operators.odometry.use: twice in one map, first in"),
         ("run: process", "run: !!python/name:os.system x", "12:10: operators.odometry.run: tag"),
@@ -134,6 +140,20 @@ def test_all_problems_are_told_at_once() -> None:
     text = GRAPH.replace("run: process", "rum: process").replace("use: mcap", "usw: mcap")
 
     assert len(refusal(text).splitlines()) == 3  # usw, use, rum
+
+
+def test_missing_value_and_mistake_are_told_together() -> None:
+    message = refusal(GRAPH.replace("run: process", "rum: process"), params={})
+
+    assert "params.recording: no value" in message
+    assert "operators.odometry.rum: unknown key" in message
+
+
+def test_unknown_parameter_is_one_problem_though_its_key_wants_another_type() -> None:
+    message = refusal(GRAPH.replace("run: process", "enabled: $on"))
+
+    (problem,) = message.splitlines()
+    assert problem.startswith("graph.yaml:12:5: operators.odometry.enabled: no parameter 'on'")
 
 
 def test_missing_value_says_how_to_give_it() -> None:
