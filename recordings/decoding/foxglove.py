@@ -105,12 +105,12 @@ def point_cloud(message: Any, notices: Counter[str]) -> LidarScan:  # noqa: ANN4
     pose = _transform(message.pose.position, message.pose.orientation)
     if np.array_equal(pose.matrix, np.eye(4)):
         return scan
-    points = (pose @ scan.points).astype(np.float32)
-    if not np.isfinite(points).all():
+    moved = (pose @ scan.points).astype(np.float32)
+    if not np.isfinite(moved).all():
         raise ValueError(f"its pose is out of all reach: {pose}")
     return LidarScan(
         stamp_ns=scan.stamp_ns,
-        points=points,
+        points=moved,
         intensity=scan.intensity,
         ring=scan.ring,
         offsets_ns=scan.offsets_ns,

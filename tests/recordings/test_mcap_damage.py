@@ -1,5 +1,6 @@
 """Damaged MCAP files: what is intact is read, what is not is counted, nothing raises half-way."""
 
+import contextlib
 from pathlib import Path
 
 import pytest
@@ -103,6 +104,45 @@ def test_damage_between_messages_without_chunks_is_passed(
         found = [message.sequence for message in recording.messages()]
 
     assert len(set(found) & set(range(45))) >= 42
+
+
+_damages = st.lists(
+    st.tuples(
+        st.sampled_from(["flip", "cut", "zero", "insert"]), st.floats(0, 0.999), st.integers(1, 60)
+    ),
+    min_size=1,
+    max_size=12,
+)
+
+
+@_quiet
+@given(damages=_damages, compression=st.sampled_from(CompressionType), has_chunks=st.booleans())
+def test_whatever_the_damage_the_only_error_is_that_nothing_is_readable(
+    tmp_path: Path,
+    damages: list[tuple[str, float, int]],
+    compression: CompressionType,
+    *,
+    has_chunks: bool,
+) -> None:
+    path = write_mcap(
+        tmp_path / "a.mcap", _CHUNKS, compression=compression, use_chunking=has_chunks
+    )
+    content = bytearray(path.read_bytes())
+    for kind, share, size in damages:
+        at = int(share * len(content))
+        if kind == "flip" and content:
+            content[at] ^= size
+        elif kind == "insert":
+            content[at:at] = bytes(range(size))
+        else:
+            content[at : at + size] = b"" if kind == "cut" else bytes(size)
+    path.write_bytes(content)
+
+    found: list[int] = []
+    with contextlib.suppress(RecordingError), McapRecording(path) as recording:
+        found = [message.log_ns for message in recording.messages()]
+
+    assert found == sorted(found)
 
 
 def test_a_damaged_chunk_is_named_with_its_messages(tmp_path: Path) -> None:

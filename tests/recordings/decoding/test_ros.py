@@ -1,9 +1,13 @@
 """ROS messages, serialized by rosbags, decode to what went in, in both encodings."""
 
+import contextlib
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from mapstream.recordings.decoding import decoder_for, message_type_of
 from mapstream.recordings.recording import Channel, RawMessage
@@ -21,6 +25,7 @@ from mapstream.streams.messages.sensors import (
 )
 from tests.recordings.decoding.made_ros import (
     STAMP_NS,
+    cloud,
     header,
     imu,
     make,
@@ -335,6 +340,29 @@ def test_a_wrong_length_names_schema_topic_time_and_reason(encoding: str) -> Non
         _decode(message)
     with pytest.raises(DecodeError, match="16 bytes are left behind its last field"):
         _decode(longer)
+
+
+@settings(max_examples=100, deadline=None)
+@given(data=st.data(), encoding=st.sampled_from(["cdr", "ros1"]))
+def test_damaged_messages_raise_nothing_but_decode_errors(
+    data: st.DataObject, encoding: str
+) -> None:
+    points = np.ones(3, [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("t", "<u4")])
+    makers: list[Callable[[str], RawMessage]] = [
+        _odometry,
+        _image,
+        _camera_info,
+        imu,
+        lambda e: cloud(e, points),
+    ]
+    message = data.draw(st.sampled_from(makers))(encoding)
+    content = bytearray(message.data)
+    for _ in range(data.draw(st.integers(1, 4))):
+        content[data.draw(st.integers(0, len(content) - 1))] = data.draw(st.integers(0, 255))
+    message.data = memoryview(bytes(content[: data.draw(st.integers(0, len(content)))]))
+
+    with contextlib.suppress(DecodeError):
+        decoder_for(message.channel)(message)
 
 
 def test_other_encapsulations_are_refused() -> None:
