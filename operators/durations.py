@@ -27,14 +27,6 @@ class Durations:
         index = min(index, _NUM_BINS)
         self._bins[index] = self._bins.get(index, 0) + 1
 
-    def merge(self, other: Durations) -> None:
-        """Add all that `other` has counted."""
-        self.count += other.count
-        self.total_ns += other.total_ns
-        self.max_ns = max(self.max_ns, other.max_ns)
-        for index, count in other._bins.items():  # of the same class
-            self._bins[index] = self._bins.get(index, 0) + count
-
     def quantile_ns(self, fraction: float) -> float:
         """Return the duration that this fraction of the calls did not exceed; nan without calls."""
         if self.count == 0:
