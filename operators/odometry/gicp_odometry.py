@@ -32,7 +32,7 @@ from mapstream.streams.messages.estimates import Odometry, PointCloud
 from mapstream.streams.messages.sensors import FloatArray, ImuBatch, LidarScan
 from mapstream.streams.trajectory import Trajectory
 
-_BEND_LIMIT_M = 0.02  # about the noise of a range
+_BEND_LIMIT_M = 0.01  # about the noise of a range
 
 
 class GicpOdometryConfig(OperatorConfig):
