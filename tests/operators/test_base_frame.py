@@ -22,7 +22,7 @@ pytestmark = pytest.mark.anyio
     ("make", "tolerance"),
     [
         (lambda: KissOdometry(KissOdometryConfig(voxel_size_m=0.5)), 1e-6),
-        (lambda: GicpOdometry(GicpOdometryConfig()), 1e-3),  # its voxels lie along the base's axes
+        (lambda: GicpOdometry(GicpOdometryConfig()), 5e-3),  # its voxels lie along the base's axes
     ],
     ids=["kiss", "gicp"],
 )
