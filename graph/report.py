@@ -25,6 +25,7 @@ class RunReport:
     was_stopped: bool  # by a request, before the sources ended
     final: Snapshot
     warnings: tuple[str, ...] = ()
+    written: tuple[str, ...] = ()  # files and folders that the run leaves behind
 
     @property
     def exit_code(self) -> int:
@@ -60,6 +61,7 @@ def report_of(
         was_stopped=was_stopped,
         final=final,
         warnings=(*warnings, *viewer_errors),
+        written=tuple(path for stage in stages for path in stage.activity.written),
     )
 
 

@@ -15,6 +15,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Awaitable, Callable
 from contextvars import ContextVar
 from dataclasses import dataclass, field
+from pathlib import Path
 from time import monotonic_ns as _monotonic_ns
 from time import thread_time_ns
 from typing import Any, ClassVar, Generic, Literal, TypeVar
@@ -76,6 +77,7 @@ class Activity:
     span_ns: tuple[int, int] | None = None  # of a source: first and last log time
     warnings: dict[str, int] = field(default_factory=dict)  # message -> how often
     losses: dict[str, int] = field(default_factory=dict)  # the same, of data that is gone
+    written: list[str] = field(default_factory=list)  # files and folders, as the user named them
 
 
 @dataclass(frozen=True, slots=True)
@@ -122,6 +124,13 @@ def report_loss(message: str) -> None:
     """
     losses = context().activity.losses
     losses[message] = losses.get(message, 0) + 1
+
+
+def report_written(path: Path) -> None:
+    """Tell the user of a file or a folder that is whole now; naming it again changes nothing."""
+    written = context().activity.written
+    if str(path) not in written:
+        written.append(str(path))
 
 
 async def offload(function: Callable[..., R], *args: object) -> R:

@@ -58,8 +58,8 @@ def run(  # noqa: PLR0913  # one for each option of the command
     request = replace(request, sets=[*_section_of(request, section), *request.sets])
     planned = plan_request(request)
     plan = planned.plan if rate is None else _at_rate(planned.plan, rate)
-    for warning in plan.warnings:
-        say_aside(f"warning: {warning}")
+    for line in [*(f"warning: {warning}" for warning in plan.warnings), *planned.notes]:
+        say_aside(line)
     report, notes = execute(plan, rerun=rerun, has_progress=not json)
     if json:
         say_json(report_as_json(report) | {"viewer": notes, "written": report.written})

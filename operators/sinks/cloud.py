@@ -12,7 +12,7 @@ import numpy as np
 from pydantic import Field, PositiveInt
 
 from mapstream.operators.maps.aggregate import AggregateConfig, aggregate_cloud
-from mapstream.operators.operator import NoPorts, Operator, offload, warn
+from mapstream.operators.operator import NoPorts, Operator, offload, report_written, warn
 from mapstream.recordings.cloud_files import write_pcd, write_ply
 from mapstream.recordings.cloud_store import CloudStore, cloud_key
 from mapstream.recordings.maps.build import add_resources
@@ -67,6 +67,7 @@ class CloudSink(Operator[Inputs, NoPorts]):
                 warn(f"no {missing} came, so {self.config.path} was not written")
                 return
             await offload(self._write, self._newest, store)
+            report_written(self.config.path)
 
     async def _keep_newest(self, maps: Receiver[Map]) -> None:
         async for map_ in maps:

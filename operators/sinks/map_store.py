@@ -16,7 +16,7 @@ from mapstream.operators.operator import (
     OperatorConfig,
     context,
     offload,
-    warn,
+    report_written,
 )
 from mapstream.recordings.cloud_store import CloudStore, cloud_key
 from mapstream.recordings.maps.build import add_resources
@@ -68,8 +68,7 @@ class MapStore(Operator[Inputs, NoPorts]):
                     tasks.start_soon(self._write_clouds, inputs.submaps)
                 tasks.start_soon(self._save_maps, inputs.maps, lock)
             if self._newest is None:
-                warn(f"no map came, so none was saved in {folder}")
-                return
+                raise MapError(f"no map came, so none was saved in {folder}")
             if self._num_saved_clouds < len(self._clouds):
                 await offload(self._save, self._newest, lock)
             await offload(self._remove_loose_clouds, folder)
@@ -123,6 +122,7 @@ class MapStore(Operator[Inputs, NoPorts]):
                 newest = later
             self._newest = newest
             await offload(self._save, newest, lock)
+            report_written(self.config.path)
 
     def _save(self, map_: Map, lock: FolderLock) -> None:
         clouds = dict(self._clouds)

@@ -15,6 +15,7 @@ from mapstream.operators.operator import (
     Ports,
     offload,
     report_loss,
+    report_written,
 )
 from mapstream.operators.sources.mcap_config import check_message_name, type_of_port
 from mapstream.recordings.foxglove_messages import as_foxglove
@@ -84,9 +85,10 @@ class McapSink(DynamicPorts, Operator[Ports, NoPorts]):
             messages = merge(*inputs.values())
             async for port, message in messages:
                 await offload(self.write, writer, topics[port], message)
-            for port_name, count in messages.stats.late.items():
-                for _ in range(count):
-                    report_loss(f"messages on {port_name} behind their time bound")
+        report_written(config.path)
+        for port_name, count in messages.stats.late.items():
+            for _ in range(count):
+                report_loss(f"messages on {port_name} behind their time bound")
 
     def write(self, writer: McapWriter, topic: str, message: Message) -> None:
         """Write one message in the schemas that were chosen.

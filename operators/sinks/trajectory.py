@@ -11,7 +11,14 @@ import anyio
 import numpy as np
 from pydantic import Field
 
-from mapstream.operators.operator import NoPorts, Operator, OperatorConfig, offload, warn
+from mapstream.operators.operator import (
+    NoPorts,
+    Operator,
+    OperatorConfig,
+    offload,
+    report_written,
+    warn,
+)
 from mapstream.recordings.maps.model import Map
 from mapstream.recordings.trajectory_files import write_euroc, write_kitti, write_tum
 from mapstream.streams.channel import Receiver
@@ -102,4 +109,6 @@ class TrajectorySink(Operator[Inputs, NoPorts]):
         path, write = self.config.path, _WRITERS[self.config.format]
         for name, trajectory in trajectories.items():
             is_only = len(trajectories) == 1
-            write(path if is_only else path.with_stem(f"{path.stem}-{name}"), trajectory)
+            file = path if is_only else path.with_stem(f"{path.stem}-{name}")
+            write(file, trajectory)
+            report_written(file)
