@@ -64,19 +64,19 @@ class Optimizer(Operator[Inputs, Outputs]):
             if every and num_submaps % every == 0:
                 await outputs.maps.send(self._live.map)
         if not num_submaps:
-            warn("optimizer: no submap came, so there is no map")
+            warn("no submap came, so there is no map")
             return
         report = await offload(self._live.finish)
         for row in report.switched_off:
-            warn(f"optimizer: loop closure {row} contradicts the rest and was switched off")
+            warn(f"loop closure {row} contradicts the rest and was switched off")
         await outputs.maps.send(self._live.map)
 
     async def _close_loops(self, loops: Receiver[LoopReport], submap: Submap) -> None:
         """Take the report on this submap; reports come in the order of the submaps."""
         report = await anext(aiter(loops), None)
         if report is None:
-            warn("optimizer: the search for loops ended before the submaps did")
+            warn("the search for loops ended before the submaps did")
         elif report.stamp_ns != submap.stamp_ns:
-            warn("optimizer: a report of loops belongs to another submap; it was used all the same")
+            warn("a report of loops belongs to another submap; it was used all the same")
         if report is not None:
             await offload(self._live.close_loops, report.edges)

@@ -112,7 +112,7 @@ class LidarLoops(Operator[Inputs, Outputs]):
             self._trails[correction.mission_id].correct(correction)
             if correction.mission_id == mission_id and correction.stamp_ns >= stamp_ns:
                 return
-        warn("lidar_loops: the optimizer's corrections ended; loops are searched by odometry")
+        warn("the optimizer's corrections ended; loops are searched by odometry")
 
     def search(self, submap: Submap, surroundings: Surroundings) -> LoopReport:
         """Look for loops from the new keyframes of one submap."""
@@ -177,11 +177,11 @@ class LidarLoops(Operator[Inputs, Outputs]):
                 source = surroundings.at(mission_id, trail, index)
                 result = self._linker.align(source, target, T_guess)
             except EstimationError as error:
-                warn(f"lidar_loops: {error}")
+                warn(f"a link to a keyframe before was not found: {error}")
                 continue
             refusal = self._gate.refusal(result, T_guess, self._config.max_distance_m)
             if refusal:
-                warn(f"lidar_loops: a link to a keyframe before was refused: {refusal.split()[0]}")
+                warn(f"a link to a keyframe before was refused: {refusal.split()[0]}")
             else:
                 ends = (index - link, index)
                 edges.append(self._edge("registration", mission_id, trail, ends, result))

@@ -8,8 +8,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from pydantic import PositiveFloat
 
-from mapstream.operators.operator import Operator, OperatorConfig, warn
+from mapstream.operators.operator import Operator, OperatorConfig, report_loss, warn
 from mapstream.streams.channel import Receiver, Sender
+from mapstream.streams.errors import EstimationError
 from mapstream.streams.messages.estimates import Keyframe, Odometry, PointCloud
 from mapstream.streams.messages.sensors import FloatArray
 from mapstream.streams.sync import exact
@@ -43,7 +44,8 @@ class Outputs:
 class Keyframes(Operator[Inputs, Outputs]):
     """Keep a moment when the robot has moved, turned or waited enough since the one before.
 
-    The first and the last moment are always kept, so that the map spans the drive.
+    The first and the last moment are always kept, so that the map spans the drive. It begins where the
+    odometry first measured: before, nobody knows where the robot was.
     Uncertainty is gathered from keyframe to keyframe over all odometry between.
     """
 
@@ -60,7 +62,14 @@ class Keyframes(Operator[Inputs, Outputs]):
 
     async def run(self, inputs: Inputs, outputs: Outputs) -> None:
         waiting: Keyframe | None = None  # the newest moment, not kept so far
+        num_unknown = 0
         async for odometry, cloud in _moments(inputs):
+            if self._previous is None and odometry.is_lost:
+                num_unknown += 1
+                continue
+            if self._previous is not None and odometry.stamp_ns <= self._previous.stamp_ns:
+                report_loss("moments whose stamp does not increase")
+                continue
             keyframe = self.moment(odometry, cloud)
             waiting = keyframe
             if self.is_due(odometry):
@@ -69,6 +78,11 @@ class Keyframes(Operator[Inputs, Outputs]):
                 await outputs.keyframes.send(keyframe)
         if waiting is not None:
             await outputs.keyframes.send(waiting)
+        if num_unknown and self._previous is None:
+            raise EstimationError(
+                f"the odometry was lost at each of {num_unknown} moments, so there is nothing to map;"
+                " its warnings say why"
+            )
 
     def moment(self, odometry: Odometry, cloud: PointCloud | None) -> Keyframe:
         """Return the keyframe that this moment would be."""
@@ -118,4 +132,4 @@ async def _moments(inputs: Inputs) -> AsyncIterator[tuple[Odometry, PointCloud |
     async for odometry, cloud in pairs:
         yield odometry, cloud
     if pairs.stats.unmatched:
-        warn(f"keyframes: {pairs.explain()}")
+        warn(pairs.explain())

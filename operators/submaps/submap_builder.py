@@ -93,7 +93,7 @@ class SubmapBuilder(Operator[Inputs, Outputs]):
                 f"the keyframe at {b.stamp_ns} ns has no covariance; it comes from `keyframes`"
             )
         if b.odometry.is_lost:
-            warn("submap_builder: a step that no sensor measured is bridged by the motion model")
+            warn("a step that no sensor measured is bridged by the motion model")
         return RelativePose(
             kind="motion_model" if b.odometry.is_lost else "odometry",
             mission_a=self._mission_id,
