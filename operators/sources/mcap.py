@@ -154,35 +154,37 @@ class McapSource(DynamicPorts, Operator[NoPorts, Ports]):
             _start_epoch(outputs)
             self._advanced_ns = None
         await outputs[played.port].send(played.message)
-        self._advance(played.log_ns, outputs)
+        self._advance(played, outputs)
 
-    def _advance(self, log_ns: int, outputs: Ports) -> None:
+    def _advance(self, played: Played, outputs: Ports) -> None:
         """Promise on every port what its messages' lag so far and the configured lateness allow."""
+        log_ns, lags = played.log_ns, played.lags
         if self._advanced_ns is not None and log_ns - self._advanced_ns < _ADVANCE_NS:
             return
         self._advanced_ns = log_ns
-        lags = [r.watch.least_offset_ns for r in self._readers.values() if r.watch.has_seen]
-        if not lags:
-            return
         lateness_ns = round(self.config.lateness_s * 1e9)
         for port, reader in self._readers.items():
-            lag_ns = reader.watch.least_offset_ns if reader.watch.has_seen else min(lags)
+            lag_ns = lags[port] if port in lags else min(lags.values())
             outputs[port].advance(log_ns + lag_ns - lateness_ns - reader.reading.batch_ns)
 
     def _report(self, activity: Activity, recording: Recording) -> None:
         """Bring the counts of warnings and losses up to date."""
+        path = recording.path
         for loss in recording.losses[self._num_losses :]:
-            text = f"{recording.path} at byte {loss.offset}: {loss.reason}"
+            topic = f"{loss.topic}: " if loss.topic else ""
+            text = f"{path} at byte {loss.offset}: {topic}{loss.reason}"
             if loss.num_messages == 0:
                 activity.warnings[text] = 1
             else:
-                activity.losses[f"{text} ({loss.num_messages or 'unknown'} messages)"] = 1
+                count = loss.num_messages or "an unknown number of"
+                activity.losses[f"{text}; {count} messages lost"] = 1
         self._num_losses = len(recording.losses)
         if self._extrinsics is not None:
             activity.warnings.update(self._extrinsics.notices)
         for reader in self._readers.values():
-            activity.warnings.update(reader.notices)
-            activity.losses.update({f"{reader.topic}: {t}": n for t, n in reader.losses.items()})
+            activity.warnings.update({f"{path}: {t}": n for t, n in reader.notices.items()})
+            of_topic = f"{path}: {reader.topic}"
+            activity.losses.update({f"{of_topic}: {t}": n for t, n in reader.losses.items()})
 
 
 def _start_epoch(outputs: Ports) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Generator
+from dataclasses import replace
 
 from mapstream.operators.sources.topic_reader import Played, TopicReader
 from mapstream.recordings.recording import Recording
@@ -21,12 +22,14 @@ class Playback:
         self._readers = readers
         self._end_ns = end_ns
         self._batches: Generator[list[Played]] | None = None
+        self._lags: dict[str, int] = {}  # least stamp - log time so far, by port
 
     def start(self, log_ns: int | None) -> None:
         """Begin at a log time, or begin there anew."""
         self.close()
         for reader in self._readers:
             reader.restart()
+        self._lags = {}
         self._batches = self._play(log_ns)
 
     def next_batch(self) -> list[Played]:
@@ -59,7 +62,7 @@ class Playback:
                 yield batch
                 batch, num_bytes = [], 0
         for reader in self._readers:
-            batch += reader.flush()
+            self._gather(batch, reader, reader.flush())
         if batch:
             yield batch
 
@@ -68,6 +71,11 @@ class Playback:
         if any(played.starts_epoch for played in found):
             for other in self._readers:
                 if other is not reader:
-                    batch += other.flush()
+                    batch += [replace(played, lags=self._lags) for played in other.flush()]
                     other.watch.restart()
-        batch += found
+        for played in found:
+            if played.starts_epoch:
+                self._lags = {}  # those of the messages before stay as they were
+            batch.append(replace(played, lags=self._lags))
+        if found:
+            self._lags[reader.reading.port] = reader.watch.least_offset_ns

@@ -20,6 +20,12 @@ class StampWatch:
     offset_ns: int | None = None  # of the newest stamp against its log time
     least_offset_ns: int = 0
     _last_ns: int | None = None
+    _texts: dict[str, str] = field(default_factory=dict)  # what was odd -> that, and where first
+
+    def note(self, what: str, log_ns: int) -> None:
+        """Count something odd; the notice says where it came first."""
+        text = self._texts.setdefault(what, f"{self.topic}: {what}, first at log time {log_ns} ns")
+        self.notices[text] += 1
 
     def see(self, stamp_ns: int, log_ns: int) -> bool:
         """Take note of one message; True if its clock jumped since the last one."""
@@ -29,23 +35,18 @@ class StampWatch:
             self.least_offset_ns = offset_ns
         elif abs(offset_ns - self.offset_ns) > self.max_jump_ns:
             way = "forward" if offset_ns > self.offset_ns else "backward"
-            self.notices[f"{self.topic}: its clock jumps {way}"] += 1
+            self.note(f"its clock jumps {way}", log_ns)
             self.restart()
             self.see(stamp_ns, log_ns)
             return True
         if self._last_ns is not None and stamp_ns < self._last_ns:
-            self.notices[f"{self.topic}: stamps run backwards"] += 1
+            self.note("stamps run backwards", log_ns)
         elif stamp_ns == self._last_ns:
-            self.notices[f"{self.topic}: stamps repeat"] += 1
+            self.note("stamps repeat", log_ns)
         self.offset_ns = offset_ns
         self.least_offset_ns = min(self.least_offset_ns, offset_ns)
         self._last_ns = stamp_ns
         return False
-
-    @property
-    def has_seen(self) -> bool:
-        """True if `least_offset_ns` says something."""
-        return self.offset_ns is not None
 
     def restart(self) -> None:
         """Forget what came before: a new epoch begins."""

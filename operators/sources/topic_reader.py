@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import dataclass, fields, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields, replace
 from functools import cache
 from itertools import groupby
 from typing import Any, Literal
@@ -15,7 +16,13 @@ from mapstream.operators.sources.stamps import StampWatch
 from mapstream.recordings.decoding import Decoder
 from mapstream.recordings.recording import RawMessage
 from mapstream.streams.errors import DecodeError, TransformError
-from mapstream.streams.messages.sensors import ImuBatch, Message, RecordRef, TransformBatch
+from mapstream.streams.messages.sensors import (
+    ImuBatch,
+    LidarScan,
+    Message,
+    RecordRef,
+    TransformBatch,
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,6 +33,7 @@ class Played:
     message: Message
     log_ns: int
     starts_epoch: bool = False
+    lags: Mapping[str, int] = field(default_factory=dict)  # of the ports in this epoch, read ahead
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -106,7 +114,8 @@ class TopicReader:
             except DecodeError as error:
                 if self.reading.stops_on_error:
                     raise
-                self._first_error = self._first_error or str(error)
+                first = str(error).removeprefix(f"{self.topic}: ")
+                self._first_error = self._first_error or first
                 self.losses[
                     f"messages that cannot be decoded; the first is {self._first_error}"
                 ] += 1
@@ -133,12 +142,12 @@ class TopicReader:
         if self.reading.stamp == "log" and len(raws) == len(batch.stamps_ns):
             batch = replace(batch, stamps_ns=np.array([raw.log_ns for raw in raws], np.int64))
         steps = np.diff(batch.stamps_ns)
-        num_repeated = int((steps == 0).sum())
-        if num_repeated:
-            self.watch.notices[f"{raws[0].topic}: stamps repeat"] += num_repeated
+        for _ in range(int((steps == 0).sum())):
+            self.watch.note("stamps repeat", raws[0].log_ns)
         if not (steps < 0).any():
             return batch
-        self.watch.notices[f"{raws[0].topic}: stamps run backwards"] += int((steps < 0).sum())
+        for _ in range(int((steps < 0).sum())):
+            self.watch.note("stamps run backwards", raws[0].log_ns)
         order = np.argsort(batch.stamps_ns, kind="stable")
         return replace(
             batch,
@@ -172,6 +181,8 @@ class TopicReader:
                 changes["T_base_sensor"] = place
         if changes:
             message = replace(message, **changes)  # type: ignore[type-var]  # a dataclass by its names
+        if isinstance(message, LidarScan) and _is_of_one_time(message):
+            self.watch.note("scans whose points all have one time, not deskewed", raw.log_ns)
         jumped = self.watch.see(message.stamp_ns, raw.log_ns)
         return [Played(reading.port, message, raw.log_ns, jumped)]
 
@@ -181,8 +192,16 @@ class TopicReader:
         if message.stamp_ns > 0 and reading.stamp == "header":
             return reading.offset_ns
         if reading.stamp == "header":
-            self.watch.notices[f"{raw.topic}: stamps of zero, the log time is used"] += 1
+            self.watch.note("stamps of zero, the log time is used", raw.log_ns)
         return reading.offset_ns + raw.log_ns - message.stamp_ns
+
+
+def _is_of_one_time(scan: LidarScan) -> bool:
+    """Return whether points carry times that say nothing."""
+    offsets_ns = scan.offsets_ns
+    return (
+        offsets_ns is not None and len(offsets_ns) > 1 and bool((offsets_ns == offsets_ns[0]).all())
+    )
 
 
 @cache

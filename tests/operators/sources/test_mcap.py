@@ -263,7 +263,10 @@ async def test_B15_odd_stamps_are_counted_by_topic_and_the_run_goes_on(tmp_path:
     stamps, warnings = await _stamps_of(tmp_path / "a.mcap", [0, 0, -150, 0, -100, 0])
 
     assert len(stamps) == 6
-    assert warnings == {"/odom: stamps run backwards": 1, "/odom: stamps repeat": 1}
+    assert warnings == {
+        f"{tmp_path / 'a.mcap'}: /odom: stamps {what}, first at log time {_START_NS + at * _MS} ns": 1
+        for what, at in [("run backwards", 200), ("repeat", 400)]
+    }
 
 
 async def test_B15_stamps_of_zero_take_the_log_time(tmp_path: Path) -> None:
@@ -276,7 +279,11 @@ async def test_B15_stamps_of_zero_take_the_log_time(tmp_path: Path) -> None:
     out = await _run(path, {"odometry": "/odom"}, run_context)
 
     assert [m.stamp_ns for m in out["odometry"]] == [_START_NS, _START_NS + 1, _START_NS + 2]
-    assert run_context.activity.warnings == {"/odom: stamps of zero, the log time is used": 3}
+    (warning,) = run_context.activity.warnings.items()
+    assert warning == (
+        f"{path}: /odom: stamps of zero, the log time is used, first at log time {_START_NS} ns",
+        3,
+    )
 
 
 async def test_B15_stamps_in_another_unit_are_named(tmp_path: Path) -> None:
@@ -290,7 +297,8 @@ async def test_B15_stamps_in_another_unit_are_named(tmp_path: Path) -> None:
 
     await _run(path, {"odometry": "/odom"}, run_context)
 
-    assert "/odom: stamps are in microseconds, not nanoseconds" in run_context.activity.warnings
+    text = f"{path}: /odom: stamps are in microseconds, not nanoseconds"
+    assert text in run_context.activity.warnings
 
 
 @pytest.mark.parametrize(("jump_ms", "way"), [(-9_000, "backward"), (9_000, "forward")])
@@ -316,7 +324,10 @@ async def test_B15_a_clock_that_jumps_starts_an_epoch(
     receiver = Receiver(edge, spans_epochs=True)
     epochs = [receiver.arrival.epoch async for _ in receiver]
     assert epochs == [0] * 25 + [1] * 15
-    assert run_context.activity.warnings == {f"/odom: its clock jumps {way}": 1}
+    (warning,) = run_context.activity.warnings
+    first_ns = _START_NS + 2_500 * _MS
+    assert warning == f"{path}: /odom: its clock jumps {way}, first at log time {first_ns} ns"
+    assert edge.stats.late == 0
 
 
 async def test_B13_a_seek_starts_an_epoch_at_its_target(tmp_path: Path) -> None:
@@ -351,7 +362,8 @@ async def test_messages_that_cannot_be_decoded_are_losses_or_stop_the_run(tmp_pa
     assert [s.stamp_ns for s in out["scans"]] == [_START_NS, _START_NS + 2]
     ((text, count),) = run_context.activity.losses.items()
     assert count == 1
-    assert f"/points: mapstream.LidarScan at log time {_START_NS + 1}" in text
+    assert "a.mcap: /points: messages that cannot" in text
+    assert f"mapstream.LidarScan at log time {_START_NS + 1}" in text
     with pytest.raises(DecodeError, match=r"mapstream.LidarScan at log time"):
         await _run(path, {"scans": "/points"}, on_error="stop")
 
