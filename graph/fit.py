@@ -97,18 +97,23 @@ def _mismatch(reading: Reading, recording: Recording) -> str | None:
     try:
         kind = decoder_for(topic.channel).message_type
     except DecodeError as error:
-        return str(error)
+        return f"{recording.path}: {error}"
     if _reads_as(topic, reading.expected):
         return None
     wanted = type_name(reading.expected)
-    return f"{topic.name} is {topic.schema_name}, read as {type_name(kind)}, not {wanted}"
+    return f"{recording.path}: {topic.name} is {topic.schema_name}, read as {type_name(kind)}, not {wanted}"
 
 
 def _describe(reading: Reading, recording: Recording) -> Iterator[str]:
     topic = recording.topics[reading.topic]
     decode = decoder_for(topic.channel)
     yield f"{topic.count} messages, {topic.frequency:.4g} Hz, {type_name(decode.message_type)}"
-    messages = [decode(raw) for raw in islice(recording.messages([topic.name]), _NUM_LOOKED_AT)]
+    messages = []
+    for raw in islice(recording.messages([topic.name]), _NUM_LOOKED_AT):
+        try:
+            messages.append(decode(raw))
+        except DecodeError as error:
+            yield str(error).removeprefix(f"{topic.name}: ")
     if any(isinstance(m, LidarScan) and m.offsets_ns is None for m in messages):
         yield "points carry no time, so scans cannot be deskewed"
     if any(message.stamp_ns <= 0 for message in messages):
@@ -130,10 +135,14 @@ def propose_topics(plan: Plan, recording: Recording) -> tuple[list[str], list[st
         found: Sequence[Topic] = topics_for(reading.expected, recording)
         kind = type_name(reading.expected)
         if len(found) != 1:
-            names = ", ".join(topic.name for topic in found)
-            reason = f"has several of type {kind}: {names}" if found else f"has none of type {kind}"
-            how = f"--set {reading.node}.topics.{reading.port}=TOPIC"
-            raise _no_topic(reading, recording, f"and {reason}; choose with {how}")
+            there = ", ".join(topic.name for topic in found or recording.topics.values())
+            reason = (
+                f"and several of type {kind}: {there}; choose with"
+                f" --set {reading.node}.topics.{reading.port}=TOPIC"
+                if found
+                else f"and none of type {kind}; there is {there or 'no message at all'}"
+            )
+            raise _no_topic(reading, recording, reason)
         topic = found[0].name
         sets.append(f"{reading.node}.topics.{reading.port}={topic}")
         remarks.append(f"reading {topic} ({found[0].schema_name}); there is no {reading.topic}")

@@ -116,6 +116,9 @@ class Meter:
     def __init__(self, stages: Sequence[Stage], links: Sequence[Link]) -> None:
         self._stages = stages
         self._links = links
+        self._spanning = {
+            s.node.name for s in stages if s.node.signature.operator_type.spans_epochs
+        }
         self._started_s = time.perf_counter()
         self._started_cpu_s = time.process_time()
 
@@ -135,7 +138,7 @@ class Meter:
             position_ns=min(positions, default=None),
             span_ns=_hull(spans),
             operators=operators,
-            edges=tuple(_edge(link) for link in self._links),
+            edges=tuple(_edge(link, link.edge.from_node in self._spanning) for link in self._links),
         )
 
 
@@ -171,7 +174,8 @@ def _operator(stage: Stage, wall_s: float) -> OperatorSnapshot:
     )
 
 
-def _edge(link: Link) -> EdgeSnapshot:
+def _edge(link: Link, spans_epochs: bool) -> EdgeSnapshot:  # noqa: FBT001
+    """Return one edge; a sender that spans epochs may go back in time, and nothing is late then."""
     channel, stats = link.channel, link.channel.stats
     return EdgeSnapshot(
         name=link.edge.name,
@@ -181,7 +185,7 @@ def _edge(link: Link) -> EdgeSnapshot:
         capacity=channel.capacity,
         high_water=stats.high_water,
         dropped={reason: count for reason, count in stats.dropped.items() if count},
-        late=stats.late,
+        late=0 if spans_epochs else stats.late,
         grown=stats.grown,
         blocked_s=stats.blocked_ns / 1e9,
         age_s=(monotonic_ns() - channel.items[0][2]) / 1e9 if channel.items else 0.0,

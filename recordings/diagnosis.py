@@ -70,8 +70,11 @@ def diagnose(recording: Recording, on_progress: Callable[[int], None] | None = N
             on_progress(raw.log_ns)
     for patient in patients.values():
         patient.finish()
+    findings: list[Finding] = []
     stamped = [patient.times for patient in patients.values() if patient.has_stamps]
-    findings = [finding for patient in patients.values() for finding in patient.findings()]
+    if not any(patient.health.num_read for patient in patients.values()):
+        findings.append(Finding(name="no_messages", topic="", text="there is no message in it"))
+    findings += [finding for patient in patients.values() for finding in patient.findings()]
     return Diagnosis(
         path=recording.path,
         duration_s=(recording.end_ns - recording.start_ns) / 1e9,
@@ -91,7 +94,7 @@ class _Patient:
         try:
             self._decoder = decoder_for(topic.channel)
         except DecodeError as error:
-            self._refusal = str(error)
+            self._refusal = str(error).removeprefix(f"{topic.name}: ")
         self._log_ns: list[int] = []
         self._stamped_log_ns: list[int] = []
         self._stamps_ns: list[int] = []
@@ -127,7 +130,7 @@ class _Patient:
             try:
                 self._take(self._decoder(raw), [raw])
             except DecodeError as error:
-                self._errors[str(error)] += 1
+                self._errors[str(error).removeprefix(f"{self._topic.name}: ")] += 1
 
     def _take(self, message: Any, raws: list[RawMessage]) -> None:  # noqa: ANN401
         if isinstance(message, ImuBatch):

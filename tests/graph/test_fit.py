@@ -116,7 +116,7 @@ class TestProposals:
                 {"left": LidarScan, "right": LidarScan},
                 "several of type LidarScan: /left, /right; choose with --set sensors.topics.scans=",
             ),
-            ({"imu": ImuBatch}, "no topic '/points', and has none of type LidarScan"),
+            ({"imu": ImuBatch}, "no topic '/points', and none of type LidarScan; there is /imu"),
         ],
     )
     def test_refusal(self, topics: dict[str, type[Message]], reason: str, folder: Path) -> None:
