@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import numpy as np
 import rerun.blueprint as rrb
 
 from mapstream.graph.plan import Plan
@@ -16,6 +17,7 @@ from mapstream.graph.tap_outputs import Output
 from mapstream.graph.views.run import GRAPH, graph_extent
 from mapstream.recordings.maps import Map
 from mapstream.streams.messages import estimates, sensors
+from mapstream.streams.messages.sensors import FloatArray
 
 _IN_SPACE = (
     sensors.LidarScan,
@@ -58,12 +60,20 @@ def blueprint_of(plan: Plan, outputs: Sequence[Output]) -> rrb.Blueprint:
     )
 
 
-def map_blueprint() -> rrb.Blueprint:
-    """Return the layout for a stored map."""
-    return rrb.Blueprint(map_view([]), rrb.TimePanel(timeline="stamp", state="hidden"), *_CLOSED)
+def map_blueprint(path: FloatArray) -> rrb.Blueprint:
+    """Return the layout for a stored map, seen from a height that shows all of its path (N, 3)."""
+    low, high = (path.min(axis=0), path.max(axis=0)) if len(path) else (np.zeros(3), np.zeros(3))
+    middle, size_m = (low + high) / 2, float(np.linalg.norm(high - low)) + 10.0
+    eye = rrb.EyeControls3D(
+        position=middle + size_m * np.array([0.0, -0.45, 0.65]),
+        look_target=middle,
+        eye_up=(0.0, 0.0, 1.0),
+    )
+    time = rrb.TimePanel(timeline="stamp", state="hidden")
+    return rrb.Blueprint(map_view([], eye), time, *_CLOSED)
 
 
-def map_view(outputs: Sequence[Output]) -> rrb.Spatial3DView:
+def map_view(outputs: Sequence[Output], eye: rrb.EyeControls3D | None = None) -> rrb.Spatial3DView:
     """Return the view of all that has a place, seen from the map's frame."""
     has_clouds = any(output.sends(estimates.PointCloud) for output in outputs)
     hidden = [o.path for o in outputs if o.sends(estimates.Keyframe)]
@@ -74,6 +84,7 @@ def map_view(outputs: Sequence[Output]) -> rrb.Spatial3DView:
         origin="/",
         contents=["+ /map/**", *(f"+ /{output.path}/**" for output in outputs)],
         overrides={f"/{path}": _HIDDEN for path in hidden},
+        eye_controls=eye,
         background=rrb.Background(color=0x0B0E14FF),
         line_grid=rrb.LineGrid3D(visible=True, spacing=10.0, color=0xFFFFFF10),
     )

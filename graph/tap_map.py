@@ -5,6 +5,8 @@ from __future__ import annotations
 import time
 from pathlib import Path
 
+import numpy as np
+
 from mapstream.graph.tap_sinks import Sink
 from mapstream.operators.maps.aggregate import AggregateConfig, aggregate_cloud
 from mapstream.recordings.maps import Map
@@ -43,7 +45,8 @@ def view_map(
         except MapError as error:  # a map without clouds still has trajectories
             notes.append(f"rerun: the map is drawn without clouds: {error}")
     end_s = time.monotonic() + sink.patience_s
-    while not sink.try_open(map_blueprint()):
+    path = map_.T_map_base(np.arange(len(map_.vertices)))[:, :3, 3]
+    while not sink.try_open(map_blueprint(path)):
         if time.monotonic() > end_s:
             raise MapError("rerun: no viewer answered; start one with `rerun`, or try save=FILE")
         time.sleep(0.2)

@@ -104,4 +104,4 @@ def _cloud(submap: Submap, poses: list[SE3], max_points: int) -> Float32Array:
         if keyframe.cloud is not None
     ]
     points = np.concatenate([np.empty((0, 3)), *clouds]).astype(np.float32)
-    return without_ceiling(points, max(float(pose.t[2]) for pose in poses))
+    return without_ceiling(points, np.array([pose.t for pose in poses]))

@@ -33,8 +33,8 @@ def view_map(map_: Map, scene: Scene) -> Drawing:
 
 def cloud_entry(map_: Map, cloud: PointCloud, scene: Scene) -> Entry:
     """Draw the cloud of a whole map, in its frame, coloured by height, without a ceiling."""
-    heights_m = map_.T_map_base(np.arange(len(map_.vertices)))[:, 2, 3]
-    points = without_ceiling(cloud.points, float(heights_m.max(initial=0.0)))
+    path = map_.T_map_base(np.arange(len(map_.vertices)))[:, :3, 3]
+    points = without_ceiling(cloud.points, path)
     colors = height_colors(points[:, 2], scene)
     return Entry.of(f"{MAP_PATH}/cloud", rr.Points3D(points, colors=colors, radii=_CLOUD_SIZE))
 

@@ -254,8 +254,10 @@ def test_a_ceiling_is_left_out_and_the_walls_stay() -> None:
     floor, ceiling = np.stack([x, y, 0 * x - 1], 1), np.stack([x, y, 0 * x + 3], 1)
     wall = np.stack([x, 0 * x + 5, np.linspace(-1, 3, 1000) ** 3 / 9], 1)
 
-    inside = without_ceiling(np.concatenate([floor, wall, ceiling]).astype(np.float32), 0.0)
-    outside = without_ceiling(np.concatenate([floor, wall]).astype(np.float32), 0.0)
+    inside = without_ceiling(
+        np.concatenate([floor, wall, ceiling]).astype(np.float32), np.zeros((1, 3))
+    )
+    outside = without_ceiling(np.concatenate([floor, wall]).astype(np.float32), np.zeros((1, 3)))
 
     assert 1700 < len(inside) < 2000
     assert inside[:, 2].max() < 2.5
