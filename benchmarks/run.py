@@ -20,14 +20,19 @@ NAMES = sorted(p.stem for p in FOLDER.glob("*.py") if p.stem not in ("run", "tab
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawTextHelpFormatter
+    )
     parser.add_argument("names", nargs="*", default=NAMES, choices=[*NAMES, []], metavar="NAME")
     names = parser.parse_args().names
     from benchmarks.table import markdown  # noqa: PLC0415  # needs the path above
 
     commit = subprocess.run(  # noqa: S603  # a fixed command
         ["git", "rev-parse", "--short", "HEAD"],  # noqa: S607
-        cwd=FOLDER, capture_output=True, text=True, check=False,
+        cwd=FOLDER,
+        capture_output=True,
+        text=True,
+        check=False,
     ).stdout.strip()
     python = platform.python_version()
     print(f"Commit {commit}, Python {python}, {platform.machine()}, {os.cpu_count()} cores.\n")

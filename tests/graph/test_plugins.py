@@ -65,7 +65,9 @@ class Clocked(Operator[Scans, Clouds]):
     async def run(self, inputs: Scans, outputs: Clouds) -> None:
         async for _ in inputs.scans:
             now_ns = context().clock.now_ns()
-            await outputs.clouds.send(PointCloud(stamp_ns=now_ns, points=np.zeros((0, 3), np.float32)))
+            await outputs.clouds.send(
+                PointCloud(stamp_ns=now_ns, points=np.zeros((0, 3), np.float32))
+            )
 
 
 class Backwards(Operator[Scans, Clouds]):
