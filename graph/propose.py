@@ -37,13 +37,13 @@ _KISS = """\
   odometry:  # gicp_odometry suits uneven ground and sparse scans
     use: kiss_odometry
     in: {scans: sensors.scans}
-    config: {voxel_size_m: 1.0, cloud_voxel_size_m: 0.25}
+    config: {cloud_voxel_size_m: 0.25}
 """
 _GICP = """\
   odometry:  # kiss_odometry is faster, and needs no IMU
     use: gicp_odometry
     in: {scans: sensors.scans, imu: sensors.imu}
-    config: {voxel_size_m: 0.4, cloud_voxel_size_m: 0.25}
+    config: {cloud_voxel_size_m: 0.25}
 """
 _LIDAR_MAP = """\
   keyframes: {use: keyframes, in: {odometry: odometry.odometry, clouds: odometry.clouds}}
@@ -53,6 +53,11 @@ _LIDAR_MAP = """\
     in:
       submaps: submaps.submaps
       corrections: {from: optimizer.corrections, feedback: true}
+"""
+_KEYFRAME_LINKS = """\
+    config: {links: [1, 2]}  # GICP between keyframes takes out what KISS-ICP drifts
+"""
+_LIDAR_OPTIMIZER = """\
   optimizer: {use: optimizer, in: {submaps: submaps.submaps, loops: loops.loops}}
 """
 _ODOMETRY_MAP = """\
@@ -102,7 +107,8 @@ def propose_graph(recording: Recording) -> str:
         also = "  # also: " + ", ".join(topic.name for topic in others) if others else ""
         lines.append(f"        {port}: {_quoted(first.name)}{also}\n")
     if "scans" in topics:
-        lines += [_GICP if "imu" in topics else _KISS, _LIDAR_MAP, _SINKS]
+        odometry, links = (_GICP, "") if "imu" in topics else (_KISS, _KEYFRAME_LINKS)
+        lines += [odometry, _LIDAR_MAP, links, _LIDAR_OPTIMIZER, _SINKS]
     else:
         lines += [_ODOMETRY_MAP, _SINKS]
     if "images" in topics:
