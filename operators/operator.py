@@ -40,7 +40,9 @@ Placement = Literal["inline", "thread", "process"]
 class OperatorConfig(BaseModel):
     """Options of an operator: frozen, unknown keys refused, defaults that work, units in the names."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid", validate_default=True)
+    model_config = ConfigDict(
+        frozen=True, extra="forbid", validate_default=True, use_attribute_docstrings=True
+    )
 
 
 @dataclass(frozen=True)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import runpy
 import shlex
 import subprocess
 import sys
@@ -146,3 +147,11 @@ def test_the_readme_and_ci_run_the_same_test_command() -> None:
 
     assert command in (ROOT / "README.md").read_text()
     assert command in (ROOT / ".ci" / "run").read_text().splitlines()
+
+
+def test_the_pages_of_operators_are_those_of_the_code() -> None:
+    """`python docs/build_operator_pages.py` makes them."""
+    folder = ROOT / "docs" / "operators"
+    written = {page.name: page.read_text() for page in folder.glob("*.md")}
+
+    assert written == runpy.run_path(str(ROOT / "docs" / "build_operator_pages.py"))["pages"]()

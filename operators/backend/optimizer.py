@@ -18,8 +18,10 @@ from mapstream.streams.messages.estimates import LoopReport, MapCorrection, Subm
 class OptimizerConfig(OperatorConfig):
     """Options of `optimizer`."""
 
-    map_every_submaps: NonNegativeInt = 0  # 0: the map is sent once, at the end
-    batch: OptimizeConfig = OptimizeConfig()  # at the end, and when loops contradict each other
+    map_every_submaps: NonNegativeInt = 0
+    """The map is sent after so many submaps; 0: once, at the end."""
+    batch: OptimizeConfig = OptimizeConfig()
+    """How the whole map is optimised, at the end and when loops contradict each other."""
 
 
 @dataclass(frozen=True)

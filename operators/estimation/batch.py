@@ -37,14 +37,18 @@ _ANNEALING = 4.0  # each round makes the robust cost this much less convex
 class OptimizeConfig(BaseModel):
     """How a map is optimised."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True)
 
     solver: Literal["lm", "dogleg"] = "lm"
-    start: Literal["current", "chordal"] = "current"  # where the poses begin
+    start: Literal["current", "chordal"] = "current"
+    """Where the poses begin."""
     max_iterations: PositiveInt = 100
-    is_robust: bool = True  # switchable edges may be switched off
-    switch_prior: PositiveFloat = 20.0  # chi2 at which a switch is one half
-    kinds: tuple[str, ...] | None = None  # of edges that take part; None: all
+    is_robust: bool = True
+    """Switchable edges may be switched off."""
+    switch_prior: PositiveFloat = 20.0
+    """Chi2 at which a switch is one half."""
+    kinds: tuple[str, ...] | None = None
+    """The kinds of edges that take part; left out, all do."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

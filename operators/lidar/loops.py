@@ -27,24 +27,42 @@ from mapstream.streams.messages.estimates import (
 class LidarLoopsConfig(OperatorConfig):
     """Options of `lidar_loops`."""
 
-    registration: str = "gicp"  # icp, plane, gicp, vgicp, or an installed one
-    registration_options: dict[str, Any] = Field(default_factory=dict)  # of an installed one
-    voxel_size_m: PositiveFloat = 0.25  # of what is registered
-    search_distances_m: tuple[PositiveFloat, ...] = (1.0, 0.4)  # of matching points, coarse to fine
-    inlier_distance_m: PositiveFloat = 0.1  # across the surface
-    min_keyframes: NonNegativeInt = 20  # between the two ends of a loop
-    min_path_m: NonNegativeFloat = 15.0  # travelled between them
-    max_distance_m: PositiveFloat = 3.0  # between them, as far as is known before
-    drift: NonNegativeFloat = 0.01  # and so much more per metre travelled since a loop closed
-    spacing_m: PositiveFloat = 2.0  # of the path between two searches
-    neighbours: NonNegativeInt = 4  # keyframes on either side whose clouds are merged
+    registration: str = "gicp"
+    """How clouds are aligned: icp, plane, gicp, vgicp, or an installed registration."""
+    registration_options: dict[str, Any] = Field(default_factory=dict)
+    """Options of an installed registration."""
+    voxel_size_m: PositiveFloat = 0.25
+    """Of the clouds that are aligned."""
+    search_distances_m: tuple[PositiveFloat, ...] = (1.0, 0.4)
+    """How far apart matching points may lie, coarse to fine."""
+    inlier_distance_m: PositiveFloat = 0.1
+    """How far from the surface a point may lie to count as an inlier."""
+    min_keyframes: NonNegativeInt = 20
+    """So many keyframes lie between the two ends of a loop."""
+    min_path_m: NonNegativeFloat = 15.0
+    """So much path lies between the two ends of a loop."""
+    max_distance_m: PositiveFloat = 3.0
+    """How far apart the two ends may be by the poses known before."""
+    drift: NonNegativeFloat = 0.01
+    """By so much per metre travelled since a loop closed, `max_distance_m` grows."""
+    spacing_m: PositiveFloat = 2.0
+    """Path between two searches."""
+    neighbours: NonNegativeInt = 4
+    """Keyframes on either side whose clouds are merged."""
     min_inlier_fraction: PositiveFloat = 0.6
+    """Of the points, for a match to be believed."""
     max_rmse_m: PositiveFloat = 0.06
-    max_turn_deg: PositiveFloat = 25.0  # away from what was known before
-    sigma_rotation_rad: PositiveFloat = 0.005  # added to what the registration claims
+    """Of the inliers, for a match to be believed."""
+    max_turn_deg: PositiveFloat = 25.0
+    """How far a match may turn away from the poses known before."""
+    sigma_rotation_rad: PositiveFloat = 0.005
+    """Uncertainty that every loop has beyond what the registration claims."""
     sigma_translation_m: PositiveFloat = 0.03
-    links: tuple[PositiveInt, ...] = ()  # also register each keyframe to those this far before it
-    max_cloud_bytes: PositiveInt = 128_000_000  # of clouds in memory; all are on disk
+    """The same of the position."""
+    links: tuple[PositiveInt, ...] = ()
+    """Also register each keyframe to those so many before it, for instance `[1, 2]`."""
+    max_cloud_bytes: PositiveInt = 128_000_000
+    """Memory for clouds; all of them are on disk."""
 
 
 @dataclass(frozen=True)

@@ -21,8 +21,10 @@ _MIN_MERGE = 1_000_000  # points that are collected before voxels are merged
 
 
 class AggregateConfig(OperatorConfig):
-    voxel_size_m: PositiveFloat = 0.1  # one point is left per voxel, the mean of those in it
-    with_unanchored: bool = False  # also missions whose place in the map is a guess
+    voxel_size_m: PositiveFloat = 0.1
+    """One point is left per voxel, the mean of those in it."""
+    with_unanchored: bool = False
+    """Also missions whose place in the map is a guess."""
 
 
 def aggregate_cloud(map_: Map, folder: Path, config: AggregateConfig) -> PointCloud:

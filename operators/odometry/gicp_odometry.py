@@ -36,22 +36,33 @@ _BEND_LIMIT_M = 0.01  # about the noise of a range
 
 
 class GicpOdometryConfig(OperatorConfig):
-    registration: str = "gicp"  # icp, plane, gicp, vgicp, or an installed one
-    registration_options: dict[str, Any] = Field(default_factory=dict)  # of an installed one
-    voxel_size_m: PositiveFloat | None = None  # of what is registered; None: by the surroundings
-    search_distances_m: tuple[PositiveFloat, ...] = (2.0, 0.7)  # of matches, coarse to fine
-    inlier_distance_m: PositiveFloat = 0.15  # across the surface
-    min_inlier_fraction: NonNegativeFloat = 0.4  # fewer: the step is not believed
+    registration: str = "gicp"
+    """How scans are aligned: icp, plane, gicp, vgicp, or an installed registration."""
+    registration_options: dict[str, Any] = Field(default_factory=dict)
+    """Options of an installed registration."""
+    voxel_size_m: PositiveFloat | None = None
+    """Of the clouds that are aligned; left out, it follows the size of the surroundings."""
+    search_distances_m: tuple[PositiveFloat, ...] = (2.0, 0.7)
+    """How far apart matching points may lie, coarse to fine."""
+    inlier_distance_m: PositiveFloat = 0.15
+    """How far from the surface a point may lie to count as an inlier."""
+    min_inlier_fraction: NonNegativeFloat = 0.4
+    """With fewer inliers a step is not believed."""
     max_range_m: PositiveFloat = 100.0
     min_range_m: NonNegativeFloat = 0.5
-    deskew: bool = True  # by the gyroscope where `imu` is connected, else by constant velocity
-    num_keyframes: PositiveInt = 10  # in the local map
+    deskew: bool = True
+    """Undo the motion within a scan, by the gyroscope where `imu` is connected, else by constant velocity."""
+    num_keyframes: PositiveInt = 10
+    """So many keyframes make the local map."""
     keyframe_distance_m: PositiveFloat = 1.5
     keyframe_angle_deg: PositiveFloat = 15.0
-    cloud_voxel_size_m: PositiveFloat = 0.25  # of the clouds that are sent on
-    max_speed_mps: PositiveFloat = 50.0  # a faster step is taken for a failure
+    cloud_voxel_size_m: PositiveFloat = 0.25
+    """Of the clouds that are sent on."""
+    max_speed_mps: PositiveFloat = 50.0
+    """A faster step is taken for a failure."""
     max_rate_radps: PositiveFloat = 6.0
-    max_lost_scans: PositiveInt = 5  # then the local map starts anew at the predicted pose
+    max_lost_scans: PositiveInt = 5
+    """After so many lost scans the local map starts anew at the predicted pose."""
 
 
 @dataclass(frozen=True)

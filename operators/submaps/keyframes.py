@@ -21,8 +21,10 @@ class KeyframesConfig(OperatorConfig):
 
     distance_m: PositiveFloat = 1.0
     rotation_rad: PositiveFloat = 0.35
-    period_s: PositiveFloat | None = None  # also while it stands still
-    odometry_sigma_rad: PositiveFloat = 0.002  # a step's, where the odometry says nothing
+    period_s: PositiveFloat | None = None
+    """Time since the last keyframe, also while the robot stands still."""
+    odometry_sigma_rad: PositiveFloat = 0.002
+    """Uncertainty of a step where the odometry says nothing."""
     odometry_sigma_m: PositiveFloat = 0.01
 
 

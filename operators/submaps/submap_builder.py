@@ -18,10 +18,12 @@ from mapstream.streams.messages.estimates import Keyframe, RelativePose, Submap
 class SubmapBuilderConfig(OperatorConfig):
     """Options of `submap_builder`: a submap ends when one of its limits is reached."""
 
-    length_m: PositiveFloat = 10.0  # of the path
+    length_m: PositiveFloat = 10.0
+    """Path within a submap."""
     duration_s: PositiveFloat = 30.0
     num_keyframes: PositiveInt = Field(default=50, ge=2)
-    mission: str = ""  # tells missions apart that begin at the same time; one robot needs none
+    mission: str = ""
+    """Tells missions apart that begin at the same time; one robot needs none."""
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,7 @@ from mapstream.streams.messages.sensors import FloatArray, ImuBatch, IntArray, L
 class LidarConfig(BaseModel):
     """A spinning LiDAR: all beams of a column fire at once, columns one after the other."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True)
 
     beams: PositiveInt = 32
     columns: PositiveInt = 512
@@ -26,18 +26,20 @@ class LidarConfig(BaseModel):
     min_range_m: NonNegativeFloat = 0.4
     max_range_m: PositiveFloat = 60.0
     range_noise_m: NonNegativeFloat = 0.01
-    dropout: NonNegativeFloat = 0.005  # share of returns that are lost
+    dropout: NonNegativeFloat = 0.005
+    """Share of returns that are lost."""
 
 
 class ImuConfig(BaseModel):
     """Noise of an IMU; densities as in its data sheet."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True)
 
     rate_hz: PositiveFloat = 200.0
     gyro_noise_radps_rthz: NonNegativeFloat = 1.7e-4
     accel_noise_mps2_rthz: NonNegativeFloat = 2.0e-3
-    gyro_bias_radps: NonNegativeFloat = 2.0e-3  # standard deviation at the start, each axis
+    gyro_bias_radps: NonNegativeFloat = 2.0e-3
+    """Standard deviation at the start, each axis."""
     accel_bias_mps2: NonNegativeFloat = 2.0e-2
     gyro_walk_radps2_rthz: NonNegativeFloat = 2.0e-5
     accel_walk_mps3_rthz: NonNegativeFloat = 3.0e-4

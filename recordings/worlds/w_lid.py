@@ -38,14 +38,20 @@ _CORNER_SPEED = 0.7  # of the speed on the straight
 class WLidConfig(BaseModel):
     """Options of W-LID."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True)
 
-    length_m: float = Field(default=300.0, ge=MIN_LENGTH_M)  # once round
-    overlap_fraction: NonNegativeFloat = 0.08  # driven a second time
-    speed_mps: PositiveFloat = 2.8  # on the straight; corners are slower
-    odometry_drift: NonNegativeFloat = 0.005  # of the distance
-    aggressive: bool = False  # spins at 90 deg/s, to one side and the other
-    blank_walls: bool = False  # corridors that say nothing of the motion along them
+    length_m: float = Field(default=300.0, ge=MIN_LENGTH_M)
+    """Length of the loop, once round."""
+    overlap_fraction: NonNegativeFloat = 0.08
+    """The part of the loop that is driven a second time."""
+    speed_mps: PositiveFloat = 2.8
+    """Speed on the straight; corners are slower."""
+    odometry_drift: NonNegativeFloat = 0.005
+    """Drift of the topic `/odometry`, as a part of the distance."""
+    aggressive: bool = False
+    """Spins at 90 deg/s, to one side and the other."""
+    blank_walls: bool = False
+    """Corridors that say nothing of the motion along them."""
     lidar: LidarConfig = LidarConfig()
     imu: ImuConfig = ImuConfig()
 
