@@ -81,7 +81,7 @@ class Artist:
                 self._draw(item, scene)
                 self._waiting_bytes += item.num_bytes
             is_due = time.monotonic() - self._flushed_s > _FLUSH_S
-            if is_due or self._waiting_bytes > _FLUSH_BYTES:
+            if (is_due and not self._sink.is_file) or self._waiting_bytes > _FLUSH_BYTES:
                 self._retry(self._flush)  # nothing may be drawn before it succeeds
         self._retry(self._flush)
         self._sink.close()

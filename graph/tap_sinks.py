@@ -13,6 +13,7 @@ import subprocess
 import sys
 import time
 from dataclasses import dataclass
+from datetime import timedelta
 from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, Protocol
@@ -31,6 +32,8 @@ if TYPE_CHECKING:
 
 DEFAULT_URL = "rerun+http://127.0.0.1:9876/proxy"
 _APPLICATION = "mapstream"
+_FILE_TICK = timedelta(seconds=10)
+_FILE_CHUNK_BYTES = 8 * 2**20
 
 
 class Sink(Protocol):
@@ -131,7 +134,11 @@ class RerunSink:
 
         if not self.is_file and not self._is_viewer_there():
             return False
-        stream = rr.RecordingStream(_APPLICATION)
+        batches = rr.ChunkBatcherConfig()
+        if self.is_file:  # few large chunks: a viewer opens them many times faster than many small ones
+            batches.flush_tick = _FILE_TICK
+            batches.flush_num_bytes = _FILE_CHUNK_BYTES
+        stream = rr.RecordingStream(_APPLICATION, batcher_config=batches)
         if self.is_file:
             stream.save(self.spec.target, default_blueprint=blueprint)
         else:
