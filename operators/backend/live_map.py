@@ -16,7 +16,7 @@ from mapstream.operators.estimation.factors import Factor, fixed, make_factors
 from mapstream.operators.estimation.incremental import IncrementalProblem
 from mapstream.operators.estimation.noise import NoiseModels
 from mapstream.operators.estimation.symbols import PoseSymbols
-from mapstream.recordings.maps.build import add_edges, append_submap
+from mapstream.recordings.maps.build import add_edges, anchored, append_submap
 from mapstream.recordings.maps.model import Map
 from mapstream.streams.errors import EstimationError
 from mapstream.streams.geometry import SE3, invert
@@ -33,8 +33,9 @@ class LiveMap:
     factors leave the problem; they stay in the map with the switch that they got.
     """
 
-    def __init__(self, config: OptimizeConfig) -> None:
+    def __init__(self, config: OptimizeConfig, T_map_first: SE3 | None = None) -> None:
         self.map = Map.empty()
+        self._T_map_first = T_map_first or SE3.identity()  # where the first mission begins
         self.num_contradictions = 0
         self._config = config
         self._problem = IncrementalProblem()
@@ -51,6 +52,8 @@ class LiveMap:
         """
         num_vertices, num_edges = len(self.map.vertices), len(self.map.edges)
         self.map = append_submap(self.map, submap, mission_name=mission_name)
+        if num_vertices == 0:
+            self.map = anchored(self.map, 0, self._T_map_first)
         for keyframe in submap.keyframes:
             self._symbols.pose_at(submap.mission_id, keyframe.stamp_ns)
         self._require_rows_are_symbols()

@@ -12,6 +12,7 @@ from mapstream.operators.estimation.batch import OptimizeConfig
 from mapstream.operators.operator import Operator, OperatorConfig, Placement, offload, warn
 from mapstream.recordings.maps.model import Map
 from mapstream.streams.channel import Receiver, Sender
+from mapstream.streams.geometry import SE3
 from mapstream.streams.messages.estimates import LoopReport, MapCorrection, Submap
 
 
@@ -20,6 +21,10 @@ class OptimizerConfig(OperatorConfig):
 
     map_every_submaps: NonNegativeInt = 0
     """The map is sent after so many submaps; 0: once, at the end."""
+    initial_position_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Where the first mission's frame lies in the map."""
+    initial_quat_xyzw: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 1.0)
+    """How the first mission's frame is turned in the map."""
     batch: OptimizeConfig = OptimizeConfig()
     """How the whole map is optimised, at the end and when loops contradict each other."""
 
@@ -52,7 +57,8 @@ class Optimizer(Operator[Inputs, Outputs]):
 
     def __init__(self, config: OptimizerConfig) -> None:
         self._config = config
-        self._live = LiveMap(config.batch)
+        T_map_first = SE3.from_quat_xyzw(config.initial_quat_xyzw, config.initial_position_m)
+        self._live = LiveMap(config.batch, T_map_first)
 
     async def run(self, inputs: Inputs, outputs: Outputs) -> None:
         every = self._config.map_every_submaps

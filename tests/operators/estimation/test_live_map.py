@@ -116,3 +116,39 @@ async def test_O1_every_submap_gives_a_correction_and_the_end_a_map() -> None:
     last = sent["corrections"][-1]
     newest = last.T_mission_odom @ drive[-1].keyframes[-1].odometry.T_odom_base
     np.testing.assert_allclose(newest.matrix, last.T_mission_base[-1], atol=1e-9)
+
+
+@pytest.mark.anyio
+async def test_G8_the_map_begins_at_the_initial_pose() -> None:
+    drive = worlds.submaps(worlds.circle(21), np.random.default_rng(0))
+    turned = OptimizerConfig(initial_position_m=(5, 6, 7), initial_quat_xyzw=(0, 0, 1, 1))
+
+    plain = (await run_operator(Optimizer(OptimizerConfig()), submaps=drive))["maps"][-1]
+    moved = (await run_operator(Optimizer(turned), submaps=drive))["maps"][-1]
+
+    T_map_first = SE3.from_quat_xyzw((0, 0, 1, 1), (5, 6, 7)).matrix
+    rows = np.arange(len(plain.vertices))
+    np.testing.assert_allclose(
+        moved.T_map_base(rows), T_map_first @ plain.T_map_base(rows), atol=1e-6
+    )
+    np.testing.assert_allclose(
+        moved.vertices.T_mission_base, plain.vertices.T_mission_base, atol=1e-6
+    )
+
+
+def test_G8_a_new_mission_begins_without_the_symbols_of_the_last() -> None:
+    """After a reset of time, poses of the same stamps are other poses, and the old ones stay."""
+    first = worlds.submaps(worlds.circle(21), np.random.default_rng(0))
+    live = LiveMap(OptimizeConfig())
+    for submap in first:
+        live.append(submap)
+    before = live.map.vertices.T_mission_base.copy()
+
+    other = "fedcba9876543210" * 2
+    for submap in first:
+        edges = tuple(replace(e, mission_a=other, mission_b=other) for e in submap.edges)
+        live.append(replace(submap, mission_id=other, edges=edges))
+
+    assert len(live.map.vertices) == 2 * len(before)
+    assert live.map.missions.is_base_frame_known.tolist() == [True, False]
+    np.testing.assert_allclose(live.map.vertices.T_mission_base[: len(before)], before, atol=1e-9)
