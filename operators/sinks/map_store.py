@@ -28,6 +28,7 @@ from mapstream.recordings.maps.store import CLOUDS, MANIFEST, TABLES_FOLDER, loa
 from mapstream.streams.channel import Receiver
 from mapstream.streams.errors import MapError
 from mapstream.streams.messages.estimates import Submap
+from mapstream.streams.waiting import Waiters
 
 
 class MapStoreConfig(OperatorConfig):
@@ -56,6 +57,9 @@ class MapStore(Operator[Inputs, NoPorts]):
         self.config = config
         self._base = Map.empty()  # the map that was there, where new ones are merged with it
         self._clouds: dict[bytes, str] = {}  # written so far: vertex id -> file in the folder
+        self._seen: set[bytes] = set()  # vertices whose submaps came and whose clouds are written
+        self._has_all_clouds = False
+        self._news = Waiters()  # of clouds
         self._newest: Map | None = None
         self._num_saved_clouds = 0  # that the saved map could refer to
 
@@ -66,6 +70,8 @@ class MapStore(Operator[Inputs, NoPorts]):
             async with anyio.create_task_group() as tasks:
                 if inputs.submaps is not None:
                     tasks.start_soon(self._write_clouds, inputs.submaps)
+                else:
+                    self._has_all_clouds = True
                 tasks.start_soon(self._save_maps, inputs.maps, lock)
             if self._newest is None:
                 raise MapError(f"no map came, so none was saved in {folder}")
@@ -97,6 +103,11 @@ class MapStore(Operator[Inputs, NoPorts]):
         with CloudStore(self.config.path / CLOUDS, max_bytes=0) as store:
             async for submap in submaps:
                 self._clouds |= await offload(self._write, submap, store)
+                mission = id_bytes(submap.mission_id)
+                self._seen |= {vertex_id(mission, frame.stamp_ns) for frame in submap.keyframes}
+                self._news.wake()
+        self._has_all_clouds = True
+        self._news.wake()
 
     def _write(self, submap: Submap, store: CloudStore) -> dict[bytes, str]:
         base = self._base
@@ -120,9 +131,16 @@ class MapStore(Operator[Inputs, NoPorts]):
             newest: Map = map_
             while (later := maps.try_receive()) is not None:
                 newest = later
+            await self._wait_for_clouds(newest)
             self._newest = newest
             await offload(self._save, newest, lock)
             report_written(self.config.path)
+
+    async def _wait_for_clouds(self, map_: Map) -> None:
+        """Wait until the newest vertex has its cloud: where clouds cannot be written, the old map stays."""
+        newest = [i.tobytes() for i in map_.vertices.id[-1:]]
+        while not (self._has_all_clouds or self._seen.issuperset(newest)):
+            await self._news.wait()
 
     def _save(self, map_: Map, lock: FolderLock) -> None:
         clouds = dict(self._clouds)
