@@ -129,6 +129,11 @@ def open_recording(path: str | Path) -> Recording:
         files = sorted(path.glob("*.mcap"))
         if len(files) == 1:  # a rosbag2 folder around one MCAP file
             return _open_mcap(files[0])
+        if not (path / "metadata.yaml").is_file():
+            what = (
+                f"{len(files)} .mcap files" if files else "neither metadata.yaml nor an .mcap file"
+            )
+            raise RecordingError(f"{path}: a folder with {what}; give one recording")
         return _open_rosbag(path)
     if not path.is_file():
         raise RecordingError(f"{path}: no such file; give an .mcap, a .bag, a .db3 or its folder")
