@@ -46,7 +46,7 @@ class RerunTap:
         *,
         settings: ViewSettings | None = None,
         max_bytes: int = MAX_BYTES,
-        max_rate_hz: float = 10.0,
+        max_rate_hz: float = 15.0,
     ) -> None:
         is_lossless = sink.is_file and plan.profile.clock.from_ == "data"
         self.queue = TapQueue(max_bytes, is_lossless=is_lossless, max_rate_hz=max_rate_hz)

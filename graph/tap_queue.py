@@ -16,6 +16,7 @@ from enum import IntEnum
 from threading import Condition
 from typing import Any
 
+from mapstream.recordings.maps import Map
 from mapstream.streams.messages import estimates, sensors
 from mapstream.streams.sizes import nbytes
 
@@ -36,8 +37,10 @@ _WORTH = {
     estimates.PointCloud: Worth.SAMPLE,
     estimates.ImageFeatures: Worth.SAMPLE,
     estimates.MapCorrection: Worth.NEWEST,
+    Map: Worth.NEWEST,
     estimates.Submap: Worth.EVERY,
 }
+_ITEM_BYTES = 512  # what Python needs around a small message
 _LARGE_BYTES = 50_000  # a message of a type that is not listed is a sample if it is larger
 _STALL_S = 10.0  # a file that takes nothing for so long is as good as full
 
@@ -69,7 +72,7 @@ class TapQueue:
         max_bytes: int,
         *,
         is_lossless: bool = False,
-        max_rate_hz: float = 10.0,
+        max_rate_hz: float = 15.0,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self.max_bytes = max_bytes
@@ -79,7 +82,8 @@ class TapQueue:
         self.high_water_bytes = 0
         self._period_s = 1 / max_rate_hz
         self._clock = clock
-        self._items: dict[int, Item] = {}  # in the order of their arrival
+        # By worth, each in the order of arrival: so that no step depends on how much waits.
+        self._items: dict[Worth, dict[int, Item]] = {worth: {} for worth in Worth}
         self._replaceable: dict[str, int] = {}  # output -> place of its item that a newer one takes
         self._accepted_s: dict[str, float] = {}
         self._num_put = self._num_taken = 0
@@ -88,12 +92,12 @@ class TapQueue:
         self._changed = Condition()
 
     def __len__(self) -> int:
-        return len(self._items)
+        return sum(map(len, self._items.values()))
 
     def put(self, path: str, message: object, epoch: int = 0) -> None:
         """Add a message, or count it as lost."""
-        num_bytes = nbytes(message)
-        worth = _worth_of(message, num_bytes)
+        num_bytes = nbytes(message) + _ITEM_BYTES
+        worth = Worth.EVERY if self.is_lossless else _worth_of(message, num_bytes)
         with self._changed:
             item = Item(
                 path=path,
@@ -106,7 +110,7 @@ class TapQueue:
             self._num_put += 1
             if self._is_closed:
                 self.lost[path, "closed"] += 1
-            elif worth is Worth.SAMPLE and not self.is_lossless and self._comes_too_soon(path):
+            elif worth is Worth.SAMPLE and self._comes_too_soon(path):
                 self.lost[path, "rate"] += 1
             else:
                 self._insert(item)
@@ -119,10 +123,12 @@ class TapQueue:
             self._num_taken += 1
             self._is_stalled = False
             self._changed.notify_all()
-            self._changed.wait_for(lambda: self._items or self._is_closed, timeout_s)
-            if not self._items:
+            self._changed.wait_for(lambda: len(self) or self._is_closed, timeout_s)
+            oldest = [(next(iter(items)), worth) for worth, items in self._items.items() if items]
+            if not oldest:
                 return None
-            item = self._remove(next(iter(self._items)))
+            place, worth = min(oldest)
+            item = self._remove(worth, place)
             self._drawn_bytes = item.num_bytes  # it is alive until it is drawn
             self.num_bytes += item.num_bytes
             return item
@@ -136,14 +142,15 @@ class TapQueue:
     @property
     def has_ended(self) -> bool:
         """True if it is closed and empty."""
-        return self._is_closed and not self._items
+        return self._is_closed and not len(self)
 
     def abandon(self) -> None:
         """Count all that was not drawn as lost."""
         with self._changed:
             self._is_closed = True
-            for place in list(self._items):
-                self._lose(place, "not drawn in time")
+            for worth, items in self._items.items():
+                while items:
+                    self._lose_oldest(worth, "not drawn in time")
             self._changed.notify_all()
 
     def _comes_too_soon(self, path: str) -> bool:
@@ -168,16 +175,15 @@ class TapQueue:
         if self.is_lossless and not self._wait_for_room(item.num_bytes):
             self.lost[item.path, "memory"] += 1
             return
-        place = item.sequence
-        if not self.is_lossless and item.worth is not Worth.EVERY:
-            place = self._replaceable.get(item.path, place)
-            if place in self._items:  # the newest takes the place of the one that it outdates
-                self.num_bytes -= self._items[place].num_bytes
+        items, place = self._items[item.worth], item.sequence
+        if item.worth is not Worth.EVERY:
+            waiting = self._replaceable.get(item.path)
+            if waiting in items:  # the newest takes the place of the one that it outdates
+                place = waiting
+                self.num_bytes -= items[place].num_bytes
                 self.lost[item.path, "newer"] += 1
-            else:
-                place = item.sequence
             self._replaceable[item.path] = place
-        self._items[place] = item
+        items[place] = item
         self.num_bytes += item.num_bytes
         if not self.is_lossless:
             self._shrink()
@@ -186,17 +192,16 @@ class TapQueue:
 
     def _shrink(self) -> None:
         """Lose what is worth least, the oldest first, until the rest fits."""
-        if self.num_bytes <= self.max_bytes:
-            return
-        for place, _ in sorted(self._items.items(), key=lambda entry: (entry[1].worth, entry[0])):
-            if self.num_bytes > self.max_bytes:
-                self._lose(place, "memory")
+        for worth, items in self._items.items():
+            while items and self.num_bytes > self.max_bytes:
+                self._lose_oldest(worth, "memory")
 
-    def _lose(self, place: int, reason: str) -> None:
-        self.lost[self._remove(place).path, reason] += 1
+    def _lose_oldest(self, worth: Worth, reason: str) -> None:
+        place = next(iter(self._items[worth]))
+        self.lost[self._remove(worth, place).path, reason] += 1
 
-    def _remove(self, place: int) -> Item:
-        item = self._items.pop(place)
+    def _remove(self, worth: Worth, place: int) -> Item:
+        item = self._items[worth].pop(place)
         self.num_bytes -= item.num_bytes
         return item
 
