@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from itertools import pairwise
+from typing import Literal
 
 import gtsam
 import numpy as np
@@ -31,7 +32,7 @@ def _drive(rng: np.random.Generator) -> tuple[list[Submap], list[RelativePose]]:
     def noisy(a: SE3, b: SE3) -> SE3:
         return a.inverse() @ b @ SE3(se3_exp(rng.normal(size=6) * SIGMAS))
 
-    def edge(kind: str, a: int, b: int, T_a_b: SE3) -> RelativePose:
+    def edge(kind: Literal["odometry", "loop"], a: int, b: int, T_a_b: SE3) -> RelativePose:
         return RelativePose(
             kind=kind, mission_a=MISSION, stamp_a_ns=a, mission_b=MISSION, stamp_b_ns=b,
             T_a_b=T_a_b, covariance=np.diag(SIGMAS**2), is_switchable=kind == "loop",

@@ -27,7 +27,7 @@ def main() -> None:
     names = parser.parse_args().names
     from benchmarks.table import markdown  # noqa: PLC0415  # needs the path above
 
-    commit = subprocess.run(  # noqa: S603  # a fixed command
+    commit = subprocess.run(  # a fixed command
         ["git", "rev-parse", "--short", "HEAD"],  # noqa: S607
         cwd=FOLDER,
         capture_output=True,
