@@ -9,7 +9,11 @@ import numpy as np
 from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
 
 from mapstream.operators.lidar.loop_matcher import Gate, LoopMatcher
-from mapstream.operators.lidar.registration import RegistrationResult, make_registration
+from mapstream.operators.lidar.registration import (
+    Registration,
+    RegistrationResult,
+    make_registration,
+)
 from mapstream.operators.lidar.surroundings import Surroundings
 from mapstream.operators.lidar.trail import Place, Reach, Trail
 from mapstream.operators.operator import Operator, OperatorConfig, Placement, offload, warn
@@ -95,8 +99,8 @@ class LidarLoops(Operator[Inputs, Outputs]):
 
     def __init__(self, config: LidarLoopsConfig) -> None:
         self._config = config
-        self._matcher = _matcher(config)
-        self._linker = make_registration(config.registration, **_options(config, 1.0))
+        self._fine = _registration(config, 1.0)
+        self._matcher = LoopMatcher(self._fine, _registration(config, 2.0), grid_m=1.5)
         self._gate = Gate(
             min_inlier_fraction=config.min_inlier_fraction,
             max_rmse_m=config.max_rmse_m,
@@ -193,13 +197,13 @@ class LidarLoops(Operator[Inputs, Outputs]):
             try:
                 target = surroundings.at(mission_id, trail, index - link)
                 source = surroundings.at(mission_id, trail, index)
-                result = self._linker.align(source, target, T_guess)
+                result = self._fine.align(source, target, T_guess)
+                refusal = self._gate.refusal(result, T_guess, self._config.max_distance_m)
             except EstimationError as error:
-                warn(f"a link to a keyframe before was not found: {error}")
+                warn(f"a keyframe is not registered to one before it: {error}")
                 continue
-            refusal = self._gate.refusal(result, T_guess, self._config.max_distance_m)
             if refusal:
-                warn(f"a link to a keyframe before was refused: {refusal.split()[0]}")
+                warn("a keyframe is not registered to one before it: the match was not believed")
             else:
                 ends = (index - link, index)
                 edges.append(self._edge("registration", mission_id, trail, ends, result))
@@ -228,20 +232,12 @@ class LidarLoops(Operator[Inputs, Outputs]):
         )
 
 
-def _matcher(config: LidarLoopsConfig) -> LoopMatcher:
-    return LoopMatcher(
-        fine=make_registration(config.registration, **_options(config, 1.0)),
-        coarse=make_registration(config.registration, **_options(config, 2.0)),
-        grid_m=1.5,
+def _registration(config: LidarLoopsConfig, factor: float) -> Registration:
+    """Make the one that the config names, at a resolution."""
+    return make_registration(
+        config.registration,
+        config.registration_options,
+        leaf_size_m=factor * config.voxel_size_m,
+        search_distances_m=tuple(factor * d for d in config.search_distances_m),
+        inlier_distance_m=config.inlier_distance_m,
     )
-
-
-def _options(config: LidarLoopsConfig, factor: float) -> dict[str, Any]:
-    """Return small_gicp's options at a resolution; an installed registration has its own."""
-    if config.registration_options:
-        return config.registration_options
-    return {
-        "leaf_size_m": factor * config.voxel_size_m,
-        "search_distances_m": tuple(factor * d for d in config.search_distances_m),
-        "inlier_distance_m": config.inlier_distance_m,
-    }

@@ -7,6 +7,7 @@ Any other word is looked up among the installed entry points of the group `mapst
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from importlib.metadata import entry_points
 from typing import Any, Literal, Protocol, get_args
@@ -55,19 +56,28 @@ class Registration(Protocol):
         ...
 
 
-def make_registration(name: str, **options: Any) -> Registration:  # noqa: ANN401  # a plug-in's own options
+def make_registration(
+    name: str,
+    options: Mapping[str, Any] | None = None,
+    **built_in: Any,  # noqa: ANN401  # fields of SmallGicp
+) -> Registration:
     """Return the registration that a config names.
 
+    Args:
+        name: One of the words above, or the name of an installed entry point.
+        options: Of the config's user: for an installed one all that it gets.
+        built_in: Options of `SmallGicp`, for the built-in ones, where the user gave no other.
+
     Raises:
-        ConfigError: If the name is neither built in nor an installed entry point.
+        ConfigError: If the name is neither built in nor installed.
     """
     if name in get_args(Method):
-        return SmallGicp(method=name, **options)
+        return SmallGicp(method=name, **{**built_in, **(options or {})})
     installed = {entry.name: entry for entry in entry_points(group=GROUP)}
     if name not in installed:
         known = sorted([*get_args(Method), *installed])
         raise ConfigError(f"unknown registration {name!r}; known: {', '.join(known)}")
-    made: Registration = installed[name].load()(**options)
+    made: Registration = installed[name].load()(**(options or {}))
     return made
 
 

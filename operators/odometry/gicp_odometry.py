@@ -218,13 +218,14 @@ class GicpOdometry(Operator[Inputs, Outputs]):
 
 def _matcher(config: GicpOdometryConfig, voxel_size_m: float) -> ScanMatcher:
     def registration(factor: float, distances_m: tuple[float, ...]) -> Registration:
-        """Make one at a resolution; an installed registration has its own options."""
-        options = config.registration_options or {
-            "leaf_size_m": factor * voxel_size_m,
-            "search_distances_m": tuple(factor * d for d in distances_m),
-            "inlier_distance_m": factor * config.inlier_distance_m,
-        }
-        return make_registration(config.registration, **options)
+        """Make the one that the config names, at a resolution."""
+        return make_registration(
+            config.registration,
+            config.registration_options,
+            leaf_size_m=factor * voxel_size_m,
+            search_distances_m=tuple(factor * d for d in distances_m),
+            inlier_distance_m=factor * config.inlier_distance_m,
+        )
 
     return ScanMatcher(
         near=registration(1.0, config.search_distances_m[-1:]),

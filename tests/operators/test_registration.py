@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 
 from mapstream.operators.lidar.registration import RegistrationResult, make_registration
+from mapstream.operators.odometry.gicp_odometry import GicpOdometry, GicpOdometryConfig
 from mapstream.streams.errors import ConfigError, EstimationError
 from mapstream.streams.geometry import SE3
-from tests.operators.scenes import corridor, room, seen_from
+from tests.operators.scenes import corridor, room, scan_at, seen_from
 
 
 def _errors(
@@ -169,11 +170,28 @@ def installed_centroids(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None
 
 @pytest.mark.usefixtures("installed_centroids")
 def test_I3_a_registration_of_ones_own_is_used_by_its_name() -> None:
-    registration = make_registration("centroids", gain=1.0)
+    registration = make_registration("centroids", {"gain": 1.0}, leaf_size_m=0.5)
 
     result = registration.align(np.zeros((3, 3)), np.ones((3, 3)), SE3.identity())
 
     np.testing.assert_allclose(result.T_target_source.t, [1, 1, 1])
+
+
+@pytest.mark.usefixtures("installed_centroids")
+def test_I3_the_odometry_takes_it_by_one_word_of_its_config() -> None:
+    config = GicpOdometryConfig(
+        registration="centroids",
+        registration_options={"gain": 1.0},
+        voxel_size_m=1e-3,
+        min_range_m=0,
+    )
+    operator = GicpOdometry(config)
+    world = room()
+    operator.register(scan_at(world, 10**9))
+
+    odometry, _ = operator.register(scan_at(world - [0.2, 0.0, 0.0], 2 * 10**9))
+
+    np.testing.assert_allclose(odometry.T_odom_base.t, [0.2, 0, 0], atol=0.01)
 
 
 def test_an_unknown_name_lists_the_known_ones() -> None:
