@@ -51,6 +51,14 @@ class _Delivery:
     sender: Sender[Any]
     queue: deque[tuple[Frame, Any]] = field(default_factory=deque)
     filled: Waiters = field(default_factory=Waiters)
+    num_taken: int = 0
+
+    def try_send(self, message: object) -> bool:
+        """Send at once if that is plainly possible, which spares a round of the event loop."""
+        channels = self.sender.channels
+        is_next = bool(self.filled) and not self.queue
+        is_plain = type(self.sender) is Sender and len(channels) == 1
+        return is_next and is_plain and channels[0].offer(message)
 
     def add(self, kind: Frame, value: object = None) -> None:
         self.queue.append((kind, value))
@@ -185,7 +193,7 @@ class RemoteStage(Stage):
         receiver.close()
 
     async def _deliver(self, number: int, delivery: _Delivery) -> None:
-        sender, num_taken = delivery.sender, 0
+        sender = delivery.sender
         while True:
             while not delivery.queue:
                 await delivery.filled.wait()
@@ -194,9 +202,7 @@ class RemoteStage(Stage):
                 case Frame.MESSAGE:
                     await sender.send(value)
                     del value  # so that its memory in the ring is free while this waits
-                    num_taken += 1
-                    if self._pipe is not None and num_taken % (CREDITS_BACK // 2) == 0:
-                        self._pipe.send(Frame.CREDIT, number, lazily=True)
+                    self._count(number, delivery)
                 case Frame.BOUND:
                     sender.advance(value)
                 case Frame.EPOCH:
@@ -206,10 +212,20 @@ class RemoteStage(Stage):
                 case _:
                     return
 
+    def _count(self, number: int, delivery: _Delivery) -> None:
+        """Give credits for messages that were delivered, several at a time."""
+        delivery.num_taken += 1
+        if self._pipe is not None and delivery.num_taken % (CREDITS_BACK // 2) == 0:
+            self._pipe.send(Frame.CREDIT, number, lazily=True)
+
     def _on_frame(self, kind: Frame, port: int, body: memoryview) -> None:
         match kind:
             case Frame.MESSAGE:
-                self._deliveries[port].add(kind, unpack(body, self._reader))
+                delivery, message = self._deliveries[port], unpack(body, self._reader)
+                if delivery.try_send(message):
+                    self._count(port, delivery)
+                else:
+                    delivery.add(kind, message)
             case Frame.BOUND:
                 self._deliveries[port].add(kind, *STAMP.unpack(body))
             case Frame.EPOCH | Frame.CLOSE:

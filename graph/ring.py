@@ -17,7 +17,7 @@ import weakref
 from bisect import insort
 from collections.abc import Sequence
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -71,15 +71,15 @@ class RingWriter:
 
     def __init__(self, descriptor: int) -> None:
         memory = mmap.mmap(descriptor, 0)
-        self._memory = memoryview(memory)
+        self._memory: npt.NDArray[np.uint8] = np.frombuffer(memory, np.uint8)
         self._notes = _notes(memory)
         self._taken: list[tuple[int, int, int]] = []  # start, end, index; by start
 
-    def write(self, buffers: Sequence[memoryview]) -> Region | None:
-        """Copy the buffers into a free region; None if none is large enough now."""
+    def write(self, arrays: Sequence[npt.NDArray[Any]]) -> Region | None:
+        """Copy arrays of any layout into a free region, in C order; None if none is large enough now."""
         memory = self._memory
         self._taken = [region for region in self._taken if memory[region[2]]]
-        size = sum(_aligned(buffer.nbytes) for buffer in buffers)
+        size = sum(_aligned(array.nbytes) for array in arrays)
         start = self._gap(size)
         if start is None or len(self._taken) == _NUM_REGIONS:
             return None
@@ -87,10 +87,11 @@ class RingWriter:
         index = next(i for i in range(_NUM_REGIONS) if i not in used)
         insort(self._taken, (start, start + size, index))
         spans = []
-        for buffer in buffers:
-            num_bytes = buffer.nbytes
-            memory[start : start + num_bytes] = buffer
-            spans.append(Span(start, num_bytes, buffer.readonly))
+        for array in arrays:
+            num_bytes = array.nbytes
+            place = memory[start : start + num_bytes].view(array.dtype).reshape(array.shape)
+            place[...] = array
+            spans.append(Span(start, num_bytes, not array.flags.writeable))
             start += _aligned(num_bytes)
         memory[index] = 1
         return Region(index, tuple(spans))
@@ -120,8 +121,8 @@ class RingReader:
         self._held: dict[int, weakref.ref[npt.NDArray[np.uint8]]] = {}
         self._num_bytes_held = 0
 
-    def read(self, region: Region) -> list[memoryview]:
-        """Return the buffers of a region; it is free again when no array looks into them any more.
+    def read(self, region: Region) -> list[npt.NDArray[np.uint8]]:
+        """Return the bytes of a region's arrays; it is free again when no array looks into them any more.
 
         Where much is held already, the rest is copied, so that the writer does not run out of room.
         """
@@ -136,11 +137,11 @@ class RingReader:
             forget = partial(self._free, region.number, size)
             self._held[region.number] = weakref.ref(whole, forget)
         view = memoryview(whole)  # type: ignore[arg-type]  # typeshed: a buffer only from Python 3.12
-        parts = [view[span.start - start : span.start - start + span.size] for span in region.spans]
-        return [
-            part.toreadonly() if span.is_read_only else part
-            for part, span in zip(parts, region.spans, strict=True)
-        ]
+        parts = []
+        for span in region.spans:  # a slice of `whole` would not keep it alive, a memoryview does
+            part = view[span.start - start : span.start - start + span.size]
+            parts.append(np.frombuffer(part.toreadonly() if span.is_read_only else part, np.uint8))
+        return parts
 
     def note(self, port: int, stamp_ns: int) -> None:
         """Leave word for the writer of what was taken last from a port."""
