@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import re
-import resource
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -20,7 +18,9 @@ from mapstream.recordings.maps.store import load_map
 from mapstream.recordings.mcap_writer import McapWriter
 from tests.bad_recordings import Points, drive, flip, record, record_clouds, truncate
 from tests.data import shared
+from tests.full_disk import largest_file
 from tests.graph.terminal import Done, Terminal
+from tests.recordings.made_maps import files_under
 
 NUM_SCANS = len(drive())
 HOUR_NS = 3600 * 10**9
@@ -456,7 +456,7 @@ class TestMapFolders:
         before = files()
         other = record_clouds(Path("other.mcap"), stamp=lambda _, ns: ns + HOUR_NS)
 
-        with files_of_at_most(num_bytes):
+        with largest_file(num_bytes):
             done = run(other, "--set", "store.on_existing=replace")
 
         assert done.code == 1
@@ -469,20 +469,10 @@ class TestMapFolders:
 
 
 def files() -> dict[str, bytes]:
-    """Return what lies in the map's folder and the trajectory's file."""
-    found = {str(path): path.read_bytes() for path in Path("m").rglob("*") if path.is_file()}
-    return {name: content for name, content in found.items() if not name.endswith(LOCK)}
-
-
-@contextmanager
-def files_of_at_most(num_bytes: int) -> Iterator[None]:
-    """Let the system refuse longer files, as a full disk would."""
-    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (num_bytes, hard))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    """Return what lies in the map's folder, but for the lock, which names the last process."""
+    found = files_under(Path("m"))
+    del found[LOCK]
+    return found
 
 
 @pytest.mark.slow

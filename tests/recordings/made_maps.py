@@ -62,9 +62,7 @@ def submaps(cuts: list[int], mission: str = MISSION, *, with_clouds: bool = Fals
     for index, (start, end) in enumerate(zip([0, *cuts], cuts, strict=False)):
         frames = tuple(keyframe(i, with_cloud=with_clouds) for i in range(start, end + 1))
         edges = tuple(edge(a, b, mission) for a, b in pairwise(frames))
-        made.append(
-            Submap(mission_id=mission, index=index, keyframes=frames, edges=edges)
-        )
+        made.append(Submap(mission_id=mission, index=index, keyframes=frames, edges=edges))
     return made
 
 

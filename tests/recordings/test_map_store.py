@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import hashlib
 import json
-import resource
 import subprocess
 import sys
 import threading
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -20,20 +18,10 @@ from mapstream.recordings.maps import Map, load_map, save_map
 from mapstream.recordings.maps.combine import with_journal_entry
 from mapstream.recordings.maps.folder import LOCK, FolderLock
 from mapstream.streams.errors import MapError, MapFormatError
+from tests.full_disk import largest_file
 from tests.recordings.made_maps import files_under, full_map, line_map
 
 REPOSITORY = Path(__file__).parents[2]
-
-
-@contextmanager
-def largest_file(num_bytes: int) -> Iterator[None]:
-    """Let this process write no file beyond this size, as on a disk that is full."""
-    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (num_bytes, hard))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
 
 
 @pytest.mark.parametrize(
