@@ -6,6 +6,7 @@ import hashlib
 import logging
 import os
 import signal
+import sys
 import threading
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -89,7 +90,7 @@ class StepConfig(OperatorConfig):
     fail_at: int = -1  # raise at the block with this value
     kill_at: int = -1  # end the process with the signal
     signal: int = signal.SIGKILL
-    sleep_at: int = -1  # never return
+    sleep_at: int = -1  # say so, and never return
     gate: str = ""  # wait for this gate before each block
     log: str = ""
 
@@ -117,6 +118,8 @@ class Step(Operator[BlocksIn, BlocksOut]):
         if block.value == config.kill_at:
             os.kill(os.getpid(), config.signal)
         if block.value == config.sleep_at:
+            sys.stdout.write("asleep\n")
+            sys.stdout.flush()
             threading.Event().wait()
         data = block.data * config.factor
         return Block(stamp_ns=block.stamp_ns, value=block.value * config.factor, data=data)
