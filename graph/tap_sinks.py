@@ -135,7 +135,7 @@ class RerunSink:
         if not self.is_file and not self._is_viewer_there():
             return False
         batches = rr.ChunkBatcherConfig()
-        if self.is_file:  # few large chunks: a viewer opens them many times faster than many small ones
+        if self.is_file:  # a viewer opens few large chunks many times faster than many small ones
             batches.flush_tick = _FILE_TICK
             batches.flush_num_bytes = _FILE_CHUNK_BYTES
         stream = rr.RecordingStream(_APPLICATION, batcher_config=batches)
