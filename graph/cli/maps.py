@@ -90,6 +90,21 @@ def print_statistics(folder: Path, *, json: bool) -> None:
             say_table((what, "count"), list(counts.items()))
 
 
+@app.command()
+def view(
+    context: typer.Context,
+    *,
+    rerun: Annotated[str, typer.Option(help="spawn, connect[=URL] or save=FILE.")] = "spawn",
+) -> None:
+    """Show the map in Rerun: trajectories, loops by their switches, the cloud of all keyframes."""
+    from mapstream.graph.tap_map import view_map  # noqa: PLC0415  # rerun takes its time
+    from mapstream.graph.tap_sinks import SinkSpec  # noqa: PLC0415
+
+    folder: Path = context.obj
+    for note in view_map(load_map(folder), folder, SinkSpec.parse(rerun).open()):
+        complain(note)
+
+
 @app.command(name="export")
 def export_(
     context: typer.Context,
