@@ -53,7 +53,8 @@ def convert_kitti(source: Path, writer: McapWriter, on_progress: Progress) -> No
 def _stamps(source: Path, count: int) -> tuple[IntArray, Notices]:
     times = source / "times.txt"
     if not times.exists():
-        return np.arange(count) * KITTI_PERIOD_NS, (f"no {times.name}: stamps are nominal, 10 Hz",)
+        stamps_ns = np.arange(1, count + 1) * KITTI_PERIOD_NS  # zero would mean: no stamp
+        return stamps_ns, (f"no {times.name}: stamps are nominal, 10 Hz",)
     stamps_ns = read_times(times)
     if len(stamps_ns) < count:
         raise RecordingError(

@@ -68,7 +68,7 @@ def test_real_kitti_scans(tmp_path: Path) -> None:
     conversion = convert(f"kitti:{source}", out)
 
     scans = scans_of(out)
-    assert [s.stamp_ns for s in scans] == [0, 100_000_000, 200_000_000, 300_000_000]
+    assert [s.stamp_ns for s in scans] == [100_000_000, 200_000_000, 300_000_000, 400_000_000]
     np.testing.assert_array_equal(scans[3].points, scan[:, :3])
     assert "no times.txt: stamps are nominal, 10 Hz" in conversion.notices
     assert any("no calib.txt" in notice for notice in conversion.notices)
