@@ -63,7 +63,7 @@ operators:
         images: {topic: /camera/image/compressed, stamp: log}
   odometry: {use: kiss_odometry, in: {scans: sensors.scans}, config: {voxel_size_m: 1.0}, run: PLACE}
   decode: {use: image_decode, in: {images: sensors.images}}
-  orb: {use: orb, in: {frames: decode.frames}}
+  orb: {use: orb, in: {frames: decode.frames}, config: {max_features: 2000}}
 """
 
 
@@ -105,7 +105,7 @@ def _bare(path: Path, topics: list[str]) -> None:
     config.mapping.voxel_size = 1.0
     config.registration.max_num_threads = 1
     icp = KissICP(config)
-    decode, orb = ImageDecode(ImageDecodeConfig()), Orb(OrbConfig())
+    decode, orb = ImageDecode(ImageDecodeConfig()), Orb(OrbConfig(max_features=2000))
     for topic, message in _messages(path, topics):
         if topic == SCANS:
             icp.register_frame(message.points.astype(np.float64), np.empty(0))
