@@ -60,6 +60,8 @@ def fields_of(cls: type) -> tuple[MessageField, ...]:
         if get_origin(annotation) is Literal:
             annotation = str
         kind = get_origin(annotation) or annotation
+        alias = getattr(kind, "__value__", None)  # numpy's NDArray, where Python has type aliases
+        kind = get_origin(alias) or kind
         if kind not in (np.ndarray, SE3, *SCALARS) and not is_dataclass(kind):
             raise TypeError(f"{cls.__name__}.{field.name}: no way to write {annotation}")
         is_required = field.default is MISSING and field.default_factory is MISSING
