@@ -108,7 +108,9 @@ folder, rng = Path(sys.argv[1]), np.random.default_rng(0)
 maps = [full_map(), line_map(7)]
 save_map(maps[0], folder)
 seen = set()
-for trial in range(80):
+for trial in range(1000):
+    if trial >= 80 and len(seen) == 2:
+        break  # a busy machine takes longer until both were seen
     child = os.fork()
     if child == 0:
         while True:
