@@ -4,7 +4,7 @@ import contextlib
 from pathlib import Path
 
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import HealthCheck, assume, given, settings
 from hypothesis import strategies as st
 from mcap.writer import CompressionType
 
@@ -88,7 +88,10 @@ def test_flipped_bytes_cost_no_more_than_their_chunk(
 def test_damage_between_messages_without_chunks_is_passed(
     tmp_path: Path, data: st.DataObject
 ) -> None:
-    """Only the message that was hit, and the one before it, may be gone or changed."""
+    """Only the message that was hit, and the one before it, may be gone or changed.
+
+    A length that was hit is left out here: it takes with it as many messages as it claims to hold.
+    """
     path = write_mcap(tmp_path / "a.mcap", _CHUNKS, use_chunking=False, repeat_channels=True)
     content = bytearray(path.read_bytes())
     starts = [
@@ -97,6 +100,7 @@ def test_damage_between_messages_without_chunks_is_passed(
         if content[i : i + 1] == b"\x05" and content[i + 4 : i + 9] == bytes(5)
     ]
     position = data.draw(st.integers(starts[0], starts[-1]))
+    assume(not any(start < position <= start + 8 for start in starts))
     content[position] ^= data.draw(st.integers(1, 255))
     path.write_bytes(content)
 
