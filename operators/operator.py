@@ -188,7 +188,7 @@ async def pipeline(
     async def work(message: M, turn: anyio.Event, next_turn: anyio.Event) -> None:
         try:
             result = await offload(function, message)
-        except Exception:
+        except Exception:  # it is raised in the order of the messages, behind the results before it
             await turn.wait()
             raise
         await turn.wait()

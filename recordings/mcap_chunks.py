@@ -5,6 +5,7 @@ Finding the messages costs one short loop per record; everything else is done fo
 
 from __future__ import annotations
 
+import mmap
 import zlib
 from dataclasses import dataclass
 from typing import Final
@@ -72,6 +73,8 @@ def load(file: memoryview, segment: Segment) -> Block:
     if stop > len(file):
         raise DamageError("it reaches beyond the end of the file")
     view = _decompress(file[segment.data_start : stop], segment)
+    if segment.compression:
+        _forget(file, segment)
     if not segment.is_cut:
         if len(view) != segment.uncompressed_size:
             raise DamageError(f"{len(view)} bytes instead of {segment.uncompressed_size}")
@@ -102,6 +105,15 @@ def _decompress(data: memoryview, segment: Segment) -> memoryview:
     except (zstandard.ZstdError, RuntimeError, EOFError) as error:
         raise DamageError(f"its {segment.compression} data is damaged: {error}") from error
     raise DamageError(f"unknown compression {segment.compression!r}; known: none, zstd, lz4")
+
+
+def _forget(file: memoryview, segment: Segment) -> None:
+    """Give back the memory of a part of the file; else a long recording stays in it as a whole."""
+    first = -(-segment.data_start // mmap.PAGESIZE)
+    stop = (segment.data_start + segment.data_size) // mmap.PAGESIZE
+    if isinstance(file.obj, mmap.mmap) and stop > first:
+        pages = (first * mmap.PAGESIZE, (stop - first) * mmap.PAGESIZE)
+        file.obj.madvise(mmap.MADV_DONTNEED, *pages)
 
 
 def _index(view: memoryview, offset: int) -> Block:

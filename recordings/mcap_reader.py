@@ -227,8 +227,6 @@ class _Selection:
     def load(self, segment: Segment) -> Block:
         """Read a segment and keep the messages asked for."""
         block = load(self._view, segment)
-        if segment.compression:
-            _forget(self._view, segment.data_start, segment.data_size)
         keep = self._is_chosen[block.headers["channel"]]
         if len(block) and block.log_ns[0] < self._start_ns:
             keep &= block.log_ns >= self._start_ns
@@ -300,11 +298,3 @@ def _topics(layout: Layout) -> dict[str, Topic]:
             channel=channel, count=span.count, first_ns=span.first_ns, last_ns=span.last_ns
         )
     return topics
-
-
-def _forget(view: memoryview, start: int, size: int) -> None:
-    """Give the memory of a part of the file back; else a long recording stays in it as a whole."""
-    pages = slice(-(-start // mmap.PAGESIZE), (start + size) // mmap.PAGESIZE)
-    if isinstance(view.obj, mmap.mmap) and pages.stop > pages.start:
-        length = (pages.stop - pages.start) * mmap.PAGESIZE
-        view.obj.madvise(mmap.MADV_DONTNEED, pages.start * mmap.PAGESIZE, length)
