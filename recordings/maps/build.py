@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from mapstream.recordings.maps.ids import derived_id, id_array, id_bytes, vertex_id
 from mapstream.recordings.maps.model import Map
-from mapstream.recordings.maps.rows import concatenate
+from mapstream.recordings.maps.rows import concatenate, take
 from mapstream.recordings.maps.tables import Edges, Missions, Resources, Vertices
 from mapstream.streams.errors import MapError
 from mapstream.streams.geometry import SE3
@@ -127,20 +128,23 @@ def add_edges(map_: Map, edges: Sequence[RelativePose]) -> Map:
 def append_edges(map_: Map, added: Edges) -> Map:
     """Return the map with rows of edges, which get their ids here.
 
-    The n-th edge of one kind and source between two vertices has the same id wherever it is added.
+    The n-th edge of one kind and source between the same ends has the same id wherever it is added.
     """
-    old = map_.edges
-    near = np.isin(old.vertex_a, added.vertex_a)
-    columns = (old.kind[near], old.source[near], old.vertex_a[near], old.vertex_b[near])
-    seen: Counter[tuple[str, str, int, int]] = Counter(zip(*columns, strict=True))
+    seen = Counter(_identities(take(map_.edges, np.isin(map_.edges.vertex_a, added.vertex_a))))
+    vertices, landmarks = map_.vertices.id, map_.landmarks.id
+    tables = (vertices, vertices, landmarks, landmarks)
     ids = []
-    vertices = map_.vertices.id
-    for key in zip(added.kind, added.source, added.vertex_a, added.vertex_b, strict=True):
-        kind, source, a, b = key
-        end = vertices[b].tobytes() if b >= 0 else b""
-        ids.append(derived_id("edge", kind, source, vertices[a].tobytes(), end, seen[key]))
-        seen[key] += 1
-    return replace(map_, edges=concatenate([old, replace(added, id=id_array(ids))]))
+    for identity in _identities(added):
+        kind, source, *rows = identity
+        ends = [t[row].tobytes() if row >= 0 else b"" for t, row in zip(tables, rows, strict=True)]
+        ids.append(derived_id("edge", kind, source, *ends, seen[identity]))
+        seen[identity] += 1
+    return replace(map_, edges=concatenate([map_.edges, replace(added, id=id_array(ids))]))
+
+
+def _identities(edges: Edges) -> Iterator[tuple[Any, ...]]:
+    ends = (edges.vertex_a, edges.vertex_b, edges.landmark_a, edges.landmark_b)
+    return zip(edges.kind, edges.source, *(rows.tolist() for rows in ends), strict=True)
 
 
 def _rows_at(map_: Map, missions: Sequence[str], stamps_ns: Sequence[int]) -> IntArray:

@@ -16,14 +16,16 @@ from mapstream.streams.errors import MapError
 
 
 def select_missions(map_: Map, mission_ids: Sequence[str]) -> Map:
-    """Return the map with these missions alone; edges to other missions go with those.
+    """Return the map with these missions alone; edges to others go, and outer frames that none uses.
 
     Raises:
         MapError: If the map has no such mission.
     """
     keep = np.zeros(len(map_.missions), dtype=bool)
     keep[[map_.mission_row(mission_id) for mission_id in mission_ids]] = True
-    return map_.select(missions=keep)
+    chosen = map_.select(missions=keep)
+    used = np.isin(np.arange(len(chosen.frames)), chosen.edges.frame)
+    return chosen.select(frames=used)
 
 
 def merge_maps(maps: Sequence[Map], *, share_frame: bool = False) -> Map:
@@ -44,7 +46,20 @@ def merge_maps(maps: Sequence[Map], *, share_frame: bool = False) -> Map:
         merged = from_tables(
             {name: concatenate([old, shifted(new, num_rows)]) for name, old, new in pairs}
         )
-    return merged
+    return _with_each_frame_once(merged)
+
+
+def _with_each_frame_once(map_: Map) -> Map:
+    """Return the map without repetitions of outer frames; what referred to one refers to the first."""
+    _, first, number = np.unique(as_keys(map_.frames.id), return_index=True, return_inverse=True)
+    if len(first) == len(map_.frames):
+        return map_
+    frame = map_.edges.frame
+    is_outer = frame >= 0
+    shared = frame.copy()
+    shared[is_outer] = first[number[frame[is_outer]]]
+    map_ = replace(map_, edges=replace(map_.edges, frame=shared))
+    return map_.select(frames=np.isin(np.arange(len(map_.frames)), first))
 
 
 def _unanchored(map_: Map) -> Map:

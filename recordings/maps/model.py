@@ -19,6 +19,7 @@ from mapstream.recordings.maps.rows import select, table_digest
 from mapstream.recordings.maps.tables import (
     BoolArray,
     Edges,
+    Frames,
     ImuSamples,
     Journal,
     Landmarks,
@@ -29,6 +30,7 @@ from mapstream.recordings.maps.tables import (
     Vertices,
 )
 from mapstream.streams.errors import MapError
+from mapstream.streams.geometry import rotation_from_quat_xyzw
 from mapstream.streams.messages.sensors import FloatArray, IntArray
 from mapstream.streams.trajectory import Trajectory
 
@@ -38,10 +40,11 @@ class Map:
     """Tables that refer to each other by row; each comes after those that it refers to."""
 
     missions: Missions = field(default_factory=Missions)
+    frames: Frames = field(default_factory=Frames)
     vertices: Vertices = field(default_factory=Vertices)
+    landmarks: Landmarks = field(default_factory=Landmarks)
     edges: Edges = field(default_factory=Edges)
     imu: ImuSamples = field(default_factory=ImuSamples)
-    landmarks: Landmarks = field(default_factory=Landmarks)
     observations: Observations = field(default_factory=Observations)
     resources: Resources = field(default_factory=Resources)
     journal: Journal = field(default_factory=Journal)
@@ -115,6 +118,15 @@ class Map:
     def edges_of(self, kind: str) -> IntArray:
         """Return the rows of all edges of one kind."""
         return np.flatnonzero(self.edges.kind == kind)
+
+    def T_map_landmark(self, landmark_rows: npt.NDArray[np.integer[Any]]) -> FloatArray:
+        """Return poses (N, 4, 4) of landmarks in the map frame; a point's axes are those of its base."""
+        quat = self.landmarks.quat_base_xyzw[landmark_rows]
+        T_base_landmark = np.tile(np.eye(4), (len(quat), 1, 1))
+        is_turned = np.isfinite(quat).all(axis=1)
+        T_base_landmark[is_turned, :3, :3] = rotation_from_quat_xyzw(quat[is_turned])
+        T_base_landmark[:, :3, 3] = self.landmarks.p_base[landmark_rows]
+        return self.T_map_base(self.landmarks.vertex[landmark_rows]) @ T_base_landmark
 
     def T_map_base(self, vertex_rows: npt.NDArray[np.integer[Any]]) -> FloatArray:
         """Return poses (N, 4, 4) of vertices in the map frame, as good as their missions' anchoring."""

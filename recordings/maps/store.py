@@ -22,7 +22,7 @@ from mapstream.recordings.maps.tables import Table
 from mapstream.streams.errors import MapError, MapFormatError
 
 IDENTIFIER = "mapstream map"
-VERSION = 1
+VERSION = 2
 MANIFEST = "manifest.json"
 TABLES_FOLDER = "tables"
 CLOUDS = "clouds"  # where clouds of keyframes lie, see the resources

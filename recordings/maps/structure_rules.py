@@ -63,16 +63,31 @@ def stamps_increase(map_: Map) -> Iterable[Finding]:
     yield from where(broken, "vertices", "not later than the vertex before it in its mission")
 
 
-def edges_join_two_vertices(map_: Map) -> Iterable[Finding]:
-    """An edge does not lead back to where it begins."""
-    broken = map_.edges.vertex_a == map_.edges.vertex_b
-    yield from where(broken, "edges", "joins a vertex to itself")
+def edges_lead_somewhere_else(map_: Map) -> Iterable[Finding]:
+    """An edge has an end, its second end only beside a first one, and does not lead back to it."""
+    edges = map_.edges
+    loose = (edges.vertex_a < 0) & (edges.landmark_a < 0)
+    yield from where(loose, "edges", "has neither a vertex nor a landmark")
+    for what, a, b in (
+        ("vertex", edges.vertex_a, edges.vertex_b),
+        ("landmark", edges.landmark_a, edges.landmark_b),
+    ):
+        yield from where((a < 0) & (b >= 0), "edges", f"has a second {what} and no first one")
+        yield from where((a >= 0) & (a == b), "edges", f"joins a {what} to itself")
+
+
+def frames_have_names_of_their_own(map_: Map) -> Iterable[Finding]:
+    """Measurements name outer frames, so no two have one name."""
+    names = map_.frames.name.astype(str)
+    repeated = np.ones(len(names), dtype=bool)
+    repeated[np.unique(names, return_index=True)[1]] = False
+    yield from where(repeated | (names == ""), "frames", "the name is empty or that of another one")
 
 
 def motion_stays_in_its_mission(map_: Map) -> Iterable[Finding]:
     """What a robot measured of its own motion joins vertices of one mission."""
     edges, mission = map_.edges, map_.vertices.mission
-    binary = edges.vertex_b >= 0
+    binary = (edges.vertex_a >= 0) & (edges.vertex_b >= 0)
     broken = np.isin(edges.kind, _OF_ONE_MISSION) & ~binary
     broken[binary] = np.isin(edges.kind[binary], _OF_ONE_MISSION) & (
         mission[edges.vertex_a[binary]] != mission[edges.vertex_b[binary]]
@@ -89,7 +104,9 @@ def imu_edges_join_neighbours(map_: Map) -> Iterable[Finding]:
         rows = map_.vertices_of(mission)
         following[rows[:-1]] = rows[1:]
     edges = map_.edges
-    broken = (edges.kind == "imu") & (following[edges.vertex_a] != edges.vertex_b)
+    is_imu = edges.kind == "imu"
+    broken = np.zeros(len(edges), dtype=bool)
+    broken[is_imu] = following[edges.vertex_a[is_imu]] != edges.vertex_b[is_imu]
     yield from where(broken, "edges", "an IMU edge must lead to the next vertex of its mission")
 
 
@@ -128,7 +145,7 @@ def _components(map_: Map) -> IntArray:
     from scipy.sparse.csgraph import connected_components  # noqa: PLC0415
 
     edges, mission = map_.edges, map_.vertices.mission
-    rows = np.flatnonzero(edges.vertex_b >= 0)
+    rows = np.flatnonzero((edges.vertex_a >= 0) & (edges.vertex_b >= 0))
     rows = rows[mission[edges.vertex_a[rows]] == mission[edges.vertex_b[rows]]]
     ends = (edges.vertex_a[rows], edges.vertex_b[rows])
     size = (len(map_.vertices), len(map_.vertices))
@@ -141,7 +158,8 @@ STRUCTURE_RULES: tuple[Rule, ...] = (
     ids_are_unique,
     vertex_ids_are_derived,
     stamps_increase,
-    edges_join_two_vertices,
+    edges_lead_somewhere_else,
+    frames_have_names_of_their_own,
     motion_stays_in_its_mission,
     imu_edges_join_neighbours,
     imu_samples_belong_to_imu_edges,

@@ -132,6 +132,31 @@ class Missions(Table):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Frames(Table):
+    meaning: ClassVar[str] = (
+        "Outer reference frames in which absolute measurements speak: a geodetic plane, a motion capture room."
+    )
+
+    id: IdArray = _column("uint8", "from the name", (16,))
+    name: TextArray = _column("text", "by which measurements name it: enu, vicon ...")
+    T_map_frame: FloatArray = _column(
+        "float64", "where the frame lies in the map", (4, 4), fill=np.eye(4)
+    )
+    is_known: BoolArray = _column(
+        "bool", "whether `T_map_frame` is given; otherwise an optimizer finds it", fill=False
+    )
+    crs: TextArray = _column(
+        "text", "what its axes are: enu at the origin, or a projection as EPSG:32632", fill=""
+    )
+    origin_lla: FloatArray = _column(
+        "float64",
+        "WGS84 latitude [deg], longitude [deg], height [m] of its zero; NaN: nowhere",
+        (3,),
+        fill=_NAN,
+    )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Vertices(Table):
     meaning: ClassVar[str] = "The state of a robot at one time of one mission."
 
@@ -150,8 +175,36 @@ class Vertices(Table):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Landmarks(Table):
+    meaning: ClassVar[str] = (
+        "Anything with a place: a visual point, a LiDAR point, an object, a plane."
+    )
+
+    id: IdArray = _column("uint8", "from the first observation", (16,))
+    kind: TextArray = _column("text", "visual, lidar, object ...; kinds never meet in matching")
+    label: TextArray = _column("text", "semantic class", fill="")
+    vertex: IntArray = _column(
+        "int64", "the vertex whose base it is fixed to", refers_to="vertices"
+    )
+    p_base: FloatArray = _column("float64", "position in that base [m]", (3,))
+    quat_base_xyzw: FloatArray = _column(
+        "float64",
+        "orientation in that base; z is the normal of a plane; NaN: it has none",
+        (4,),
+        fill=_NAN,
+    )
+    covariance: FloatArray = _column(
+        "float64", "of `p_base` [m^2]; NaN: unknown", (3, 3), fill=_NAN
+    )
+    quality: TextArray = _column("text", "unknown, bad or good", fill="unknown")
+    payload: BytesArray = _column("bytes", "what a kind needs beyond this", fill=b"")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Edges(Table):
-    meaning: ClassVar[str] = "A constraint between two vertices, or on one."
+    meaning: ClassVar[str] = (
+        "A constraint on vertices, landmarks and outer frames; the kind says on which."
+    )
 
     id: IdArray = _column(
         "uint8", "from kind, source, vertices, and how many such edges come before", (16,), fill=0
@@ -159,13 +212,37 @@ class Edges(Table):
     kind: TextArray = _column(
         "text", "odometry, loop, imu, absolute, fixed ...; unknown kinds are kept as they are"
     )
-    vertex_a: IntArray = _column("int64", "the first vertex", refers_to="vertices")
+    vertex_a: IntArray = _column(
+        "int64",
+        "the first vertex; -1 where landmarks alone are constrained",
+        refers_to="vertices",
+        is_optional=True,
+        fill=-1,
+    )
     vertex_b: IntArray = _column(
-        "int64", "the second; -1 where there is one only", refers_to="vertices", is_optional=True
+        "int64",
+        "the second; -1 where there is one only",
+        refers_to="vertices",
+        is_optional=True,
+        fill=-1,
+    )
+    landmark_a: IntArray = _column(
+        "int64", "the first landmark", refers_to="landmarks", is_optional=True, fill=-1
+    )
+    landmark_b: IntArray = _column(
+        "int64", "the second landmark", refers_to="landmarks", is_optional=True, fill=-1
+    )
+    frame: IntArray = _column(
+        "int64",
+        "the outer frame of an absolute measurement; -1: the map frame",
+        refers_to="frames",
+        is_optional=True,
+        fill=-1,
     )
     T_a_b: FloatArray = _column(
         "float64",
-        "the measured transform; `T_map_base` on an edge with one vertex",
+        "the measured transform: from the second vertex to the first, from the sensor to the outer frame,"
+        " from the landmark to the base",
         (4, 4),
         fill=np.eye(4),
     )
@@ -181,7 +258,9 @@ class Edges(Table):
     switch: FloatArray = _column("float64", "0 (false) to 1 (true)", fill=1.0)
     switch_variance: FloatArray = _column("float64", "NaN: unknown", fill=_NAN)
     source: TextArray = _column("text", "the operator that measured it", fill="")
-    payload: BytesArray = _column("bytes", "what a kind needs beyond this", fill=b"")
+    payload: BytesArray = _column(
+        "bytes", "what a kind needs beyond this; kinds of mapstream write JSON", fill=b""
+    )
 
     def T_a_b_of(self, row: int) -> SE3:
         return SE3(self.T_a_b[row])
@@ -195,26 +274,6 @@ class ImuSamples(Table):
     stamp_ns: IntArray = _column("int64", "[ns]")
     gyro_radps: FloatArray = _column("float64", "[rad/s]", (3,))
     accel_mps2: FloatArray = _column("float64", "specific force [m/s^2]", (3,))
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Landmarks(Table):
-    meaning: ClassVar[str] = (
-        "Anything with a place: a visual point, a LiDAR point, an object, a plane."
-    )
-
-    id: IdArray = _column("uint8", "from the first observation", (16,))
-    kind: TextArray = _column("text", "visual, lidar, object ...; kinds never meet in matching")
-    label: TextArray = _column("text", "semantic class", fill="")
-    vertex: IntArray = _column(
-        "int64", "the vertex whose base it is fixed to", refers_to="vertices"
-    )
-    p_base: FloatArray = _column("float64", "position in that base [m]", (3,))
-    covariance: FloatArray = _column(
-        "float64", "of `p_base` [m^2]; NaN: unknown", (3, 3), fill=_NAN
-    )
-    quality: TextArray = _column("text", "unknown, bad or good", fill="unknown")
-    payload: BytesArray = _column("bytes", "what a kind needs beyond this", fill=b"")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

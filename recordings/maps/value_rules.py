@@ -17,6 +17,13 @@ from mapstream.streams.messages.sensors import FloatArray
 
 _ROTATION_TOLERANCE = 1e-6  # poses that were composed thousands of times stay below it
 _COVARIANCE_TOLERANCE = 1e-9  # relative: what inverting an information matrix leaves
+_OPTIONAL_STATES = (
+    ("vertices", "velocity_mps"),
+    ("vertices", "gyro_bias_radps"),
+    ("vertices", "accel_bias_mps2"),
+    ("frames", "origin_lla"),
+    ("landmarks", "quat_base_xyzw"),
+)
 _QUALITIES = ["unknown", "bad", "good"]
 
 
@@ -58,10 +65,10 @@ def rigid_transforms(map_: Map) -> Iterable[Finding]:
 
 def finite_states(map_: Map) -> Iterable[Finding]:
     """Velocities, biases and positions of landmarks are known as a whole, or not at all."""
-    for column in ("velocity_mps", "gyro_bias_radps", "accel_bias_mps2"):
-        values = getattr(map_.vertices, column)
+    for table, column in _OPTIONAL_STATES:
+        values = getattr(map_.tables()[table], column)
         broken = ~_is_finite(values) & ~_is_unknown(values)
-        yield from where(broken, "vertices", f"{column} is neither finite nor wholly unknown (NaN)")
+        yield from where(broken, table, f"{column} is neither finite nor wholly unknown (NaN)")
     lost = ~_is_finite(map_.landmarks.p_base)
     yield from where(lost, "landmarks", "the position is not finite")
 

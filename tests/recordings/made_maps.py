@@ -11,7 +11,7 @@ import numpy as np
 from mapstream.recordings.maps.build import append_edges, append_submap
 from mapstream.recordings.maps.ids import derived_id, id_array
 from mapstream.recordings.maps.model import Map
-from mapstream.recordings.maps.tables import Edges, ImuSamples, Landmarks, Observations
+from mapstream.recordings.maps.tables import Edges, Frames, ImuSamples, Landmarks, Observations
 from mapstream.streams.geometry import SE3
 from mapstream.streams.messages.estimates import (
     Keyframe,
@@ -105,7 +105,16 @@ def full_map() -> Map:
         sensor=np.array(["camera", "camera", "lidar", "camera", "camera"], dtype=object),
         keypoint_px=np.ones((5, 2), dtype=np.float32),
     )
-    return replace(map_, imu=samples, landmarks=landmarks, observations=observations)
+    frames = Frames(
+        id=id_array([derived_id("frame", "enu")]),
+        name=np.array(["enu"], dtype=object),
+        origin_lla=np.array([[47.3, 8.5, 410.0]]),
+    )
+    map_ = replace(map_, frames=frames, imu=samples, landmarks=landmarks, observations=observations)
+    fix = Edges(
+        kind=np.array(["absolute"], dtype=object), vertex_a=np.array([2]), frame=np.array([0])
+    )
+    return append_edges(map_, fix)
 
 
 def files_under(folder: Path) -> dict[str, bytes]:

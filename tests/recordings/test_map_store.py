@@ -76,7 +76,7 @@ def test_a_save_writes_changed_tables_and_leaves_no_others(tmp_path: Path) -> No
     after = {path: path.stat().st_mtime_ns for path in (tmp_path / "tables").iterdir()}
     [changed] = after.items() - before.items()
     assert changed[0].name.startswith("vertices-")
-    assert len(after) == len(before) == 8
+    assert len(after) == len(before) == 9
     assert map_.digest() == full_map().digest()  # though its file is gone
 
 
@@ -141,7 +141,7 @@ def test_a_killed_save_leaves_the_old_map_or_the_new_one(tmp_path: Path) -> None
     assert run.returncode == 0, run.stdout + run.stderr
     assert load_map(folder).digest() in {full_map().digest(), line_map(7).digest()}
     save_map(line_map(2), folder)
-    assert len(list((folder / "tables").iterdir())) == 8  # leftovers of the killed are gone
+    assert len(list((folder / "tables").iterdir())) == 9  # leftovers of the killed are gone
 
 
 def test_a_map_can_be_read_while_it_is_saved(tmp_path: Path) -> None:
@@ -183,10 +183,10 @@ def test_a_folder_without_a_map_is_refused(tmp_path: Path) -> None:
 
 def test_another_version_is_refused(tmp_path: Path) -> None:
     save_map(line_map(2), tmp_path)
-    edit_manifest(tmp_path, version=2)
+    edit_manifest(tmp_path, version=3)
 
     with pytest.raises(
-        MapFormatError, match="format version 2, but this mapstream reads version 1"
+        MapFormatError, match="format version 3, but this mapstream reads version 2"
     ):
         load_map(tmp_path)
 
