@@ -80,7 +80,7 @@ def test_S3_a_pose_graph_says_what_it_leaves_out(tmp_path: Path) -> None:
     report = export_map(placed_map(), tmp_path, tmp_path / "drive.g2o", CONFIG)
 
     assert report.written == {"poses": 6, "edges": 5}
-    assert report.left_out == {"imu": 5}
+    assert report.left_out == {"imu": 5, "absolute": 1}
     assert len(import_map(tmp_path / "drive.g2o", ImportConfig()).edges) == 5
 
 
@@ -104,7 +104,7 @@ def test_S6_poses_and_edges_go_into_a_recording(tmp_path: Path) -> None:
     report = export_map(map_, tmp_path, tmp_path / "drive.mcap", CONFIG)
 
     assert report.written == {"poses": 6, "edges": 5}
-    assert report.left_out == {"imu": 5}
+    assert report.left_out == {"imu": 5, "absolute": 1}
     with open_recording(tmp_path / "drive.mcap") as recording:
         decoders = {name: decoder_for(topic.channel) for name, topic in recording.topics.items()}
         messages = [decoders[raw.topic](raw) for raw in recording.messages()]

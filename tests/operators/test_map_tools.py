@@ -25,7 +25,7 @@ NUM_VERTICES = 8
 
 def test_statistics_of_a_map_made_by_hand() -> None:
     map_ = merge_maps([full_map(), line_map(4, OTHER_MISSION)])
-    switches = np.array([1.0, 0.2, *[1.0] * 11])
+    switches = np.array([1.0, 0.2, *[1.0] * 12])
     map_ = replace(map_, edges=replace(map_.edges, switch=switches))
 
     found = map_statistics(map_)
@@ -36,6 +36,7 @@ def test_statistics_of_a_map_made_by_hand() -> None:
     assert first.duration_s == pytest.approx(2.5)
     assert found.length_m == pytest.approx(8 * np.linalg.norm([1.0, 0.0, 0.02]), rel=1e-3)
     assert [(e.kind, e.count, e.num_switched_off) for e in found.edges] == [
+        ("absolute", 1, 0),
         ("imu", 5, 0),
         ("odometry", 8, 1),
     ]
