@@ -15,6 +15,7 @@ from typing import Any
 
 from mapstream.graph.links import Link
 from mapstream.graph.stage import Stage, State
+from mapstream.streams.clock import Clock, ReplayClock
 
 _UNREAD = "unread"  # what an operator that returned early left behind: its choice, no loss
 
@@ -74,6 +75,7 @@ class Snapshot:
     cpu_s: float  # of all processes of the run
     rss_bytes: int  # of this process
     now_ns: int  # event time
+    auto_rate: float | None  # that the clock achieved, times real time; None if it does not adapt
     position_ns: int | None  # of the source that is behind: log time
     span_ns: tuple[int, int] | None  # of all sources
     operators: tuple[OperatorSnapshot, ...]
@@ -122,7 +124,7 @@ class Meter:
         self._started_s = time.perf_counter()
         self._started_cpu_s = time.process_time()
 
-    def snapshot(self, now_ns: int) -> Snapshot:
+    def snapshot(self, clock: Clock) -> Snapshot:
         wall_s = time.perf_counter() - self._started_s
         operators = tuple(_operator(stage, wall_s) for stage in self._stages)
         elsewhere_s = sum(o.cpu_s for o in operators if o.placement == "process")
@@ -134,12 +136,19 @@ class Meter:
             wall_s=wall_s,
             cpu_s=time.process_time() - self._started_cpu_s + elsewhere_s,
             rss_bytes=resident_bytes(),
-            now_ns=now_ns,
+            now_ns=clock.now_ns(),
+            auto_rate=_auto_rate(clock),
             position_ns=min(positions, default=None),
             span_ns=_hull(spans),
             operators=operators,
             edges=tuple(_edge(link, link.edge.from_node in self._spanning) for link in self._links),
         )
+
+
+def _auto_rate(clock: Clock) -> float | None:
+    if isinstance(clock, ReplayClock) and clock.is_adapting:
+        return clock.achieved_rate
+    return None
 
 
 def _hull(spans: Iterable[tuple[int, int]]) -> tuple[int, int] | None:

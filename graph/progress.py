@@ -80,6 +80,8 @@ def describe(snapshot: Snapshot) -> str:
     parts = []
     if not math.isnan(snapshot.speed):
         parts.append(f"{snapshot.speed:.1f} x real time")
+    if snapshot.auto_rate is not None:
+        parts.append(f"automatic rate {snapshot.auto_rate:.1f} x")
     if snapshot.limiting is not None:
         busiest = next(o for o in snapshot.operators if o.name == snapshot.limiting)
         parts.append(f"limited by {busiest.name} ({100 * busiest.busy_fraction:.0f} % busy)")

@@ -16,6 +16,7 @@ import anyio
 from mapstream.graph.links import Link, edges_with_epochs
 from mapstream.graph.metrics import Meter, Snapshot
 from mapstream.graph.observed import ObservedSender, Tap, Taps
+from mapstream.graph.pace import clock_of
 from mapstream.graph.plan import Edge, Node, Plan
 from mapstream.graph.remote import RemoteStage
 from mapstream.graph.report import RunReport, report_of
@@ -25,7 +26,7 @@ from mapstream.graph.stop import Stop
 from mapstream.graph.watch import Watch
 from mapstream.operators.operator import Context
 from mapstream.streams.channel import Channel, Receiver, Sender
-from mapstream.streams.clock import Clock, ReplayClock, WallClock
+from mapstream.streams.clock import Clock
 from mapstream.streams.errors import OperatorError
 from mapstream.streams.spool import DiskSpool
 
@@ -53,7 +54,7 @@ async def run_graph(
         stop: A request makes the sources end; what is under way is finished and saved. The second
             request cancels everything.
     """
-    run = _Run(plan, clock or clock_of(plan), taps, stop or Stop())
+    run = _Run(plan, clock, taps, stop or Stop())
     async with anyio.create_task_group() as background:
         background.start_soon(run.watch.run)
         background.start_soon(run.obey)
@@ -68,14 +69,6 @@ async def run_graph(
     if on_progress is not None:
         on_progress(report.final)
     return report
-
-
-def clock_of(plan: Plan) -> Clock:
-    """Return the clock that the profile of a plan asks for."""
-    spec = plan.profile.clock
-    if spec.from_ == "wall":
-        return WallClock()
-    return ReplayClock(None if spec.rate == "max" else spec.rate)
 
 
 def policy_of(node: Node, plan: Plan) -> OnErrorSpec:
@@ -94,15 +87,16 @@ def _channel(edge: Edge) -> Channel[Any]:
 class _Run:
     """A plan with everything opened."""
 
-    def __init__(self, plan: Plan, clock: Clock, taps: Sequence[Tap], stop: Stop) -> None:
+    def __init__(self, plan: Plan, clock: Clock | None, taps: Sequence[Tap], stop: Stop) -> None:
         self._plan = plan
-        self._clock = clock
         self._stop = stop
         self._taps = Taps(taps)
         self.scope = anyio.CancelScope()
         self._links = [Link(edge, _channel(edge)) for edge in plan.edges]
         self._marked = edges_with_epochs(plan)
-        self.stages = {name: self._stage(node) for name, node in plan.nodes.items()}
+        self.stages: dict[str, Stage] = {}
+        self._clock = clock or clock_of(plan.profile.clock, self.stages, self._links)
+        self.stages |= {name: self._stage(node) for name, node in plan.nodes.items()}
         self.watch = Watch(self.stages, self._links, self._on_deadlock)
         self._meter = Meter(list(self.stages.values()), self._links)
 
@@ -155,7 +149,7 @@ class _Run:
     async def tell(self, on_progress: Callable[[Snapshot], None], period_s: float) -> None:
         while True:
             await anyio.sleep(period_s)
-            on_progress(self._meter.snapshot(self._clock.now_ns()))
+            on_progress(self._meter.snapshot(self._clock))
 
     def _stop_sources(self) -> None:
         for stage in self.stages.values():
@@ -176,7 +170,7 @@ class _Run:
         return report_of(
             self._plan.name,
             list(self.stages.values()),
-            self._meter.snapshot(self._clock.now_ns()),
+            self._meter.snapshot(self._clock),
             was_stopped=self._stop.is_requested,
             was_cut=self.scope.cancelled_caught,
             viewer_errors=self._taps.errors,

@@ -162,7 +162,9 @@ class ClockSpec(Spec):
     """Where event time comes from, and how fast it goes."""
 
     from_: Annotated[Literal["data", "wall"], Field(alias="from")] = "data"
-    rate: Literal["max"] | PositiveFloat = "max"  # times real time
+    rate: Literal["max", "auto"] | PositiveFloat = (
+        "max"  # times real time; `auto` follows the queues
+    )
 
 
 class ProfileSpec(Spec):

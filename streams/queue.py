@@ -79,6 +79,12 @@ class Channel(Generic[T]):
     def is_sender_waiting(self) -> bool:
         return bool(self.senders)
 
+    @property
+    def fill(self) -> float:
+        """How full it is: at 1, room is left for one message (or for none, if it holds but one)."""
+        fill = (len(self.items) - self.num_marks) / max(1, self.capacity - 1)
+        return fill if self._max_bytes is None else max(fill, self._num_bytes / self._max_bytes)
+
     def _is_full(self) -> bool:
         num_messages = len(self.items) - self.num_marks
         limit = self._max_bytes

@@ -20,25 +20,24 @@ _POLL_S = 0.002  # how often a full queue is looked at again
 
 @dataclass(slots=True)
 class AutoRate:
-    """Replay as fast as the slowest operator allows: queues stay below `limit`, nothing is dropped.
+    """Replay as fast as the slowest operator allows: no queue fills up, nothing is dropped.
 
-    The rate falls while queues are half full and climbs while they are nearly empty. With `limit - 1`
-    messages queued none passes at all.
+    The rate falls while the fullest queue is half full and climbs while it is nearly empty. While it
+    is full nothing passes at all.
     """
 
-    limit: int
-    depth: Callable[[], int]  # messages in the fullest queue
+    fill: Callable[[], float]  # of the fullest queue: 0 is empty, at 1 nothing more may come
     min_rate: float = 0.01
     max_rate: float = 1000.0
 
     def adapted(self, rate: float) -> float:
-        depth = self.depth()
-        if 2 * depth >= self.limit:
+        fill = self.fill()
+        if fill >= 0.5:
             return max(rate * 0.9, self.min_rate)
-        return min(rate * 1.1, self.max_rate) if 4 * depth <= self.limit else rate
+        return min(rate * 1.1, self.max_rate) if fill <= 0.3 else rate
 
     def is_full(self) -> bool:
-        return self.depth() >= self.limit - 1
+        return self.fill() >= 1.0
 
 
 class ReplayClock:
@@ -87,6 +86,11 @@ class ReplayClock:
     def rate(self) -> float | None:
         """Event time per real time that is aimed at; None is as fast as possible."""
         return self._rate
+
+    @property
+    def is_adapting(self) -> bool:
+        """True if the rate follows the queues."""
+        return self._auto is not None
 
     @property
     def is_paused(self) -> bool:
@@ -198,6 +202,7 @@ class ReplayClock:
             self._is_started = True
             return True
         if self._auto is not None and self._auto.is_full():
+            self._hold_at(min(self._deadlines_ns))
             return False
         if not self._is_started:
             self._stamp_ns, self._anchor_ns = stamp_ns, self._monotonic_ns()
@@ -210,20 +215,27 @@ class ReplayClock:
         self._adapt()
         return True
 
+    def _hold_at(self, stamp_ns: int) -> None:
+        """Let no time pass that would have to be made up for in one burst."""
+        if self._is_started and self.now_ns() > stamp_ns:
+            self._stamp_ns, self._anchor_ns = stamp_ns, self._monotonic_ns()
+
     async def _wait(self, stamp_ns: int) -> None:
         if self._is_paused:
             await self._changed.wait()
             return
         left_s = (stamp_ns - self.now_ns()) / 1e9 / (self._rate or 1.0)
+        is_held = self._auto is not None and self._auto.is_full()
         if self._auto is not None:
-            left_s = _POLL_S if self._auto.is_full() else min(left_s, _SLICE_S)
+            left_s = _POLL_S if is_held else min(left_s, _SLICE_S)
         with anyio.CancelScope() as nap:
             self._naps.add(nap)
             try:
                 await self._sleep(left_s)
             finally:
                 self._naps.discard(nap)
-        self._adapt()
+        if not is_held:
+            self._adapt()
 
     def _adapt(self) -> None:
         if self._auto is not None and self._rate is not None:

@@ -37,7 +37,10 @@ def run(  # noqa: PLR0913  # one for each option of the command
     param: ParamList = None,
     set_: SetList = None,
     profile: ProfileName = "replay",
-    rate: Annotated[str | None, typer.Option(help="Times real time, such as 1.0; or max.")] = None,
+    rate: Annotated[
+        str | None,
+        typer.Option(help="Times real time, such as 1.0; max; or auto, which follows the queues."),
+    ] = None,
     start_s: Annotated[
         float | None, typer.Option("--start", help="Seconds into the recording.")
     ] = None,
@@ -45,6 +48,10 @@ def run(  # noqa: PLR0913  # one for each option of the command
         float | None, typer.Option("--end", help="Seconds into the recording.")
     ] = None,
     rerun: RerunOption = "off",
+    trace: Annotated[
+        Path | None,
+        typer.Option(help="A file to fill with snapshots of the run, a line of JSON each."),
+    ] = None,
     json: JsonFlag = False,
 ) -> None:
     """Run a graph. Ctrl-C stops the sources, finishes what is under way and saves; again: quits."""
@@ -60,7 +67,7 @@ def run(  # noqa: PLR0913  # one for each option of the command
     plan = planned.plan if rate is None else _at_rate(planned.plan, rate)
     for line in [*(f"warning: {warning}" for warning in plan.warnings), *planned.notes]:
         say_aside(line)
-    report, notes = execute(plan, rerun=rerun, has_progress=not json)
+    report, notes = execute(plan, rerun=rerun, trace=trace, has_progress=not json)
     if json:
         say_json(report_as_json(report) | {"viewer": notes, "written": report.written})
     else:
@@ -89,11 +96,15 @@ def _section_of(request: Request, section: dict[str, float | None]) -> list[str]
 
 def _at_rate(plan: Plan, rate: str) -> Plan:
     """Return the plan with its clock at another rate."""
+    if plan.profile.clock.from_ == "wall":
+        raise typer.BadParameter(
+            f"--rate is for replays; the profile {plan.profile_name!r} runs by the wall clock"
+        )
     try:
-        value = "max" if rate == "max" else float(rate)
+        value = rate if rate in ("max", "auto") else float(rate)
     except ValueError:
-        raise typer.BadParameter(f"expected a number or max, found {rate!r}") from None
-    if value != "max" and not 0 < float(value) < float("inf"):
+        raise typer.BadParameter(f"expected a number, max or auto, found {rate!r}") from None
+    if isinstance(value, float) and not 0 < value < float("inf"):
         raise typer.BadParameter(f"expected more than 0, found {rate!r}")
     clock = plan.profile.clock.model_copy(update={"rate": value})
     return replace(plan, profile=plan.profile.model_copy(update={"clock": clock}))

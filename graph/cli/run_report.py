@@ -65,7 +65,8 @@ def _outcome(report: RunReport) -> str:
 
 
 def _speed(final: Snapshot) -> str:
-    return "" if math.isnan(final.speed) else f", {final.speed:.1f} x real time"
+    speed = "" if math.isnan(final.speed) else f", {final.speed:.1f} x real time"
+    return speed + ("" if final.auto_rate is None else f", automatic rate {final.auto_rate:.1f} x")
 
 
 def _limit(final: Snapshot) -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from contextlib import ExitStack
+from pathlib import Path
 
 import anyio
 
@@ -15,20 +16,20 @@ from mapstream.graph.run import run_graph
 from mapstream.graph.stop import Stop, on_signals
 from mapstream.graph.tap import RerunTap
 from mapstream.graph.tap_sinks import SinkSpec
-from mapstream.streams.clock import Clock, WallClock
-from mapstream.streams.replay_clock import ReplayClock
+from mapstream.graph.trace import TraceFile
 
 
 def execute(
-    plan: Plan, *, rerun: str = "off", has_progress: bool = True
+    plan: Plan, *, rerun: str = "off", trace: Path | None = None, has_progress: bool = True
 ) -> tuple[RunReport, list[str]]:
-    """Run a plan to its end, with a viewer if `rerun` names one and a bar on a terminal.
+    """Run a plan to its end: a viewer if `rerun` names one, a file of snapshots, a bar on a terminal.
 
     Returns:
         The report, and what the viewer's user should know.
 
     Raises:
         ConfigError: If the viewer cannot be opened.
+        OSError: If the trace cannot be written.
     """
     spec = SinkSpec.parse(rerun)
     tap = None if spec.kind == "off" else RerunTap(plan, spec.open())
@@ -36,6 +37,8 @@ def execute(
     with ExitStack() as stack:
         if has_progress:
             listeners.append(stack.enter_context(ProgressBar()))
+        if trace is not None:
+            listeners.append(stack.enter_context(TraceFile(trace)))
         try:
             report = anyio.run(_run, plan, [] if tap is None else [tap], listeners)
         finally:
@@ -53,13 +56,4 @@ async def _run(
 
     stop = Stop()
     async with on_signals(stop):
-        return await run_graph(
-            plan, clock=_clock_of(plan), taps=taps, on_progress=on_progress, stop=stop
-        )
-
-
-def _clock_of(plan: Plan) -> Clock:
-    clock = plan.profile.clock
-    if clock.from_ == "wall":
-        return WallClock()
-    return ReplayClock(None if clock.rate == "max" else clock.rate)
+        return await run_graph(plan, taps=taps, on_progress=on_progress, stop=stop)

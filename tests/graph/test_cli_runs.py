@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -93,6 +94,44 @@ class TestRun:
             mapstream("run", graph, drive, "--rate", rate, "--param", f"out={rate}.tum")
 
         assert Path("max.tum").read_bytes() == Path("50.tum").read_bytes()
+
+    def test_B12_auto_rate_is_told_and_changes_no_result(
+        self, mapstream: Terminal, graph: Path, drive: Path
+    ) -> None:
+        mapstream("run", graph, drive)
+        at_once = Path("out.tum").read_bytes()
+
+        done = mapstream("run", graph, drive, "--rate", "auto")
+        found = mapstream("run", graph, drive, "--rate", "auto", "--json").json
+
+        assert "automatic rate" in done.out
+        assert Path("out.tum").read_bytes() == at_once
+        assert found["status"] == "complete"
+        assert found["auto_rate"] > 1.0  # the rate climbs while the queues are empty
+
+    def test_B12_a_profile_may_ask_for_auto_rate(
+        self, mapstream: Terminal, graph: Path, drive: Path
+    ) -> None:
+        graph.write_text(GRAPH + "profiles: {easy: {clock: {rate: auto}}}\n")
+
+        found = mapstream("run", graph, drive, "--profile", "easy", "--json").json
+
+        assert found["auto_rate"] > 1.0
+
+    def test_B12_no_rate_for_a_run_by_the_wall_clock(
+        self, mapstream: Terminal, graph: Path, drive: Path
+    ) -> None:
+        done = mapstream("run", graph, drive, "--profile", "live", "--rate", "auto")
+
+        assert done.code == 2
+        assert "the profile 'live' runs by the wall clock" in done.err
+
+    def test_P7_trace_of_a_run(self, mapstream: Terminal, graph: Path, drive: Path) -> None:
+        done = mapstream("run", graph, drive, "--trace", "trace.jsonl")
+
+        assert done.code == 0
+        last = json.loads(Path("trace.jsonl").read_text().splitlines()[-1])
+        assert [edge["sent"] for edge in last["edges"]] == [20]
 
     def test_recording_that_is_not_there(self, mapstream: Terminal, graph: Path) -> None:
         done = mapstream("run", graph, "nowhere.mcap")

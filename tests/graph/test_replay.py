@@ -3,28 +3,33 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import anyio
 import anyio.lowlevel
+import numpy as np
 import pytest
 
 from mapstream.graph.plan import Edge, Plan
+from mapstream.graph.progress import describe
 from mapstream.graph.report import RunReport
 from mapstream.graph.run import run_graph
-from mapstream.operators.operator import NoPorts, Operator, context
+from mapstream.graph.spec import ClockSpec, ProfileSpec
+from mapstream.operators.operator import NoPorts, Operator, context, offload
 from mapstream.streams.channel import Arrival, Limits, Sender
 from mapstream.streams.clock import Clock, ReplayClock
 from tests.graph.made_plans import chain, make_plan, node
 from tests.graph.operators_for_tests import (
     COLLECTED,
     Block,
+    BlocksIn,
     BlocksOut,
     Collect,
     ManySteps,
     Source,
     Step,
     Sum,
+    Zip,
 )
 
 pytestmark = pytest.mark.anyio
@@ -161,6 +166,12 @@ class Rates:
     gnss: Sender[Block]
 
 
+@dataclass(frozen=True)
+class PairOut:
+    a: Sender[Block]
+    b: Sender[Block]
+
+
 class Robot(Operator[NoPorts, Rates]):
     """Four sensors of different rates; each message comes when its delay is over, not when it was true."""
 
@@ -199,6 +210,74 @@ async def test_B8_sensors_of_different_rates_and_delays_lose_nothing() -> None:
     assert report.status == "complete"
     counts = {port: len(COLLECTED[f"{port}_sink"]) for port in ports}
     assert counts == {"imu": 800, "lidar": 40, "camera": 80, "gnss": 4}
+
+
+class Slow(Operator[BlocksIn, BlocksOut]):
+    """Works on each message for a while, in a thread."""
+
+    async def run(self, inputs: BlocksIn, outputs: BlocksOut) -> None:
+        async for block in inputs.blocks:
+            await outputs.blocks.send(await offload(self.work, block))
+
+    def work(self, block: Block) -> Block:
+        for _ in range(100):
+            np.sort(np.random.default_rng(block.value).normal(size=300))
+        return block
+
+
+async def test_B12_auto_rate_goes_as_fast_as_the_slowest_operator_and_drops_nothing() -> None:
+    """Edges that would drop when full hold less than they could, at a rate that nobody chose."""
+    count = 200
+    plan = make_plan(
+        {
+            "source": node(Source, count=count, period_ns=_PERIOD_NS, is_paced=True),
+            "slow": node(Slow, "thread"),
+            "sink": node(Collect),
+        },
+        "source.blocks -> slow.blocks",
+        "slow.blocks -> sink.blocks",
+        limits=Limits(policy="drop_oldest", capacity=8),
+    )
+    plan = replace(plan, profile=ProfileSpec(clock=ClockSpec(rate="auto")))
+
+    report = await run_graph(plan)
+
+    edge = report.final.edges[0]
+    assert len(outputs()) == count
+    assert (report.status, edge.num_lost) == ("complete", 0)
+    assert edge.high_water < edge.capacity
+    assert report.final.auto_rate is not None
+    assert report.final.auto_rate > 2.0
+    assert f"automatic rate {report.final.auto_rate:.1f} x" in describe(report.final)
+
+
+class Lagging(Operator[NoPorts, PairOut]):
+    """Sends on `b` long after `a` what belongs together, at the pace of the clock."""
+
+    async def run(self, inputs: NoPorts, outputs: PairOut) -> None:
+        for index in range(100):
+            stamp_ns = index * _PERIOD_NS
+            await context().clock.sleep_until(stamp_ns)
+            await outputs.a.send(Block(stamp_ns=stamp_ns, value=index))
+            if index >= 50:
+                await outputs.b.send(Block(stamp_ns=stamp_ns - 50 * _PERIOD_NS, value=index))
+
+
+async def test_B12_auto_rate_does_not_wait_for_a_join_that_waits_for_the_source() -> None:
+    plan = make_plan(
+        {"source": node(Lagging), "zip": node(Zip), "sink": node(Collect)},
+        "source.a -> zip.a",
+        "source.b -> zip.b",
+        "zip.blocks -> sink.blocks",
+        limits=Limits(capacity=4),
+    )
+    plan = replace(plan, profile=ProfileSpec(clock=ClockSpec(rate="auto")))
+
+    with anyio.fail_after(20):
+        report = await run_graph(plan)
+
+    assert len(outputs()) == 50
+    assert report.final.edges[0].grown > 0
 
 
 async def _run(plan: Plan, clock: Clock, taps: tuple[object, ...] = ()) -> RunReport:
