@@ -14,9 +14,11 @@ import numpy.typing as npt
 
 from mapstream.streams.arrays import frozen, frozen_optional
 from mapstream.streams.geometry import SE3
+from mapstream.streams.messages.constraints import Constraint
 from mapstream.streams.messages.sensors import (
     Float32Array,
     FloatArray,
+    ImuBatch,
     IntArray,
     RecordRef,
 )
@@ -77,6 +79,19 @@ class RelativePose:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Splice:
+    """A pose inside a stretch that went out already, for measurements that came late.
+
+    Each of its edges with the source of an edge over the whole interval takes part of that one's place:
+    the optimizer removes the old edge (OmniMapper, section III-C, "pose splicing").
+    """
+
+    keyframe: Keyframe
+    edges: tuple[RelativePose, ...]
+    constraints: tuple[Constraint, ...] = ()
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Keyframe:
     """A moment worth a vertex, with what was seen at it.
 
@@ -101,6 +116,10 @@ class Submap:
     index: int  # 0, 1, 2 ... within the mission
     keyframes: tuple[Keyframe, ...]
     edges: tuple[RelativePose, ...]
+    constraints: tuple[Constraint, ...] = ()  # each at the stamp of a keyframe of the mission
+    imu: ImuBatch | None = None  # samples from the first to the last keyframe, and one beyond each
+    splices: tuple[Splice, ...] = ()  # into earlier submaps of the mission; they come first
+    sensors: str = "{}"  # JSON: the sensor set with its calibration; that of submap 0 counts
 
     def __post_init__(self) -> None:
         if not self.keyframes:

@@ -7,6 +7,7 @@ import numpy as np
 
 from mapstream.streams.calibration import CameraCalibration
 from mapstream.streams.geometry import SE3
+from mapstream.streams.messages.constraints import Constraint, LandmarkRef, OuterFrame
 from mapstream.streams.messages.estimates import (
     ImageFeatures,
     Keyframe,
@@ -16,6 +17,7 @@ from mapstream.streams.messages.estimates import (
     Odometry,
     PointCloud,
     RelativePose,
+    Splice,
     Submap,
 )
 from mapstream.streams.messages.sensors import (
@@ -87,6 +89,16 @@ def one_of_each(seed: int) -> list[Any]:
         kind="loop", mission_a=mission, stamp_a_ns=1, mission_b=mission, stamp_b_ns=2, T_a_b=pose(),
         covariance=covariance(), is_switchable=True,
     )  # fmt: skip
+    constraint = Constraint(
+        stamp_ns=stamp, kind="position", T_a_b=pose(), covariance=np.diag([np.inf] * 3 + [1.0] * 3),
+        outer=maybe(OuterFrame(name="enu", crs="enu", origin_lla=maybe(np.array([47.0, 8.0, 400.0])))),
+        landmark=maybe(LandmarkRef(name="door", kind="plane", label="wall")), payload=rng.bytes(n),
+    )  # fmt: skip
+    splice = Splice(keyframe=keyframe, edges=(edge, edge), constraints=(constraint,))
+    imu = ImuBatch(
+        stamps_ns=np.arange(n + 1), gyro_radps=rng.normal(size=(n + 1, 3)),
+        accel_mps2=rng.normal(size=(n + 1, 3)), is_saturated=maybe(np.zeros(n + 1, bool)),
+    )  # fmt: skip
     return [
         LidarScan(
             stamp_ns=stamp, points=points, intensity=maybe(intensity),
@@ -98,10 +110,7 @@ def one_of_each(seed: int) -> list[Any]:
             stamp_ns=stamp, image=rng.integers(0, 999, (4, 5)).astype(np.uint16), encoding="16UC1"
         ),
         EncodedImage(stamp_ns=stamp, data=np.frombuffer(rng.bytes(n), np.uint8), format="jpeg"),
-        ImuBatch(
-            stamps_ns=np.arange(n + 1), gyro_radps=rng.normal(size=(n + 1, 3)),
-            accel_mps2=rng.normal(size=(n + 1, 3)), is_saturated=maybe(np.zeros(n + 1, bool)),
-        ),
+        imu, constraint,
         LaserScan2D(
             stamp_ns=stamp, ranges_m=np.array([1, np.nan, 2], np.float32), angle_min_rad=-1.0,
             angle_step_rad=0.1, range_min_m=0.0, range_max_m=float("inf"), beam_period_ns=n,
@@ -122,6 +131,7 @@ def one_of_each(seed: int) -> list[Any]:
         odometry, cloud, edge, keyframe,
         Submap(
             mission_id=mission, index=n, keyframes=(keyframe,) * (n + 1), edges=(edge,) * n,
+            constraints=(constraint,) * n, imu=maybe(imu), splices=(splice,) * n,
         ),
         LoopReport(
             stamp_ns=stamp, edges=(edge,) * n,
