@@ -15,6 +15,7 @@ import pytest
 from mapstream.graph.catalogue import Catalogue
 from mapstream.graph.load import load_graph
 from mapstream.graph.plan import plan
+from tests.installed import look_installed
 
 ROOT = Path(__file__).parent.parent
 PAGES = [
@@ -41,28 +42,19 @@ def name_of(page: Path) -> str:
 
 
 @pytest.fixture
-def installed_example(tmp_path: Path) -> Path:
-    """A folder that, on Python's path, makes the example package look installed."""
-    site = tmp_path / "site"
-    info = site / "near_field-0.1.0.dist-info"
-    info.mkdir(parents=True)
-    (site / "near_field").symlink_to(OWN_OPERATOR / "near_field")
-    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: near-field\nVersion: 0.1.0\n")
-    lines = (OWN_OPERATOR / "pyproject.toml").read_text().splitlines()
-    start = lines.index('[project.entry-points."mapstream.operators"]') + 1
-    entry = lines[start].replace('"', "")
-    (info / "entry_points.txt").write_text(f"[mapstream.operators]\n{entry}\n")
-    return site
+def installed_examples(tmp_path: Path) -> Path:
+    """A folder that, on Python's path, makes the packages of the examples look installed."""
+    return look_installed(tmp_path / "site", (ROOT / "examples").rglob("pyproject.toml"))
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("page", pages_with("console"), ids=name_of)
-def test_commands_on_the_page_succeed(page: Path, tmp_path: Path, installed_example: Path) -> None:
+def test_commands_on_the_page_succeed(page: Path, tmp_path: Path, installed_examples: Path) -> None:
     """Lines `$ mapstream ...` run in order in one folder; `# exits N` names another exit code than 0."""
     folder = tmp_path / "work"
     folder.mkdir()
     (folder / "examples").symlink_to(ROOT / "examples")
-    environment = {**os.environ, "PYTHONPATH": str(installed_example), "COLUMNS": "200"}
+    environment = {**os.environ, "PYTHONPATH": str(installed_examples), "COLUMNS": "200"}
     for line in "\n".join(blocks(page, "console")).splitlines():
         if not line.startswith("$ mapstream "):
             continue  # output, or an installation that the fixture stands for
@@ -86,8 +78,8 @@ def test_python_on_the_page_compiles(page: Path) -> None:
         compile(body, str(page), "exec")
 
 
-def test_Q1_snippets_of_the_own_operator_run(installed_example: Path) -> None:
-    environment = {**os.environ, "PYTHONPATH": str(installed_example)}
+def test_Q1_snippets_of_the_own_operator_run(installed_examples: Path) -> None:
+    environment = {**os.environ, "PYTHONPATH": str(installed_examples)}
     body = "\n".join(blocks(OWN_OPERATOR / "README.md", "python"))
 
     done = subprocess.run(

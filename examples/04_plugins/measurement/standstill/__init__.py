@@ -1,0 +1,1 @@
+"""A measurement for mapstream: the robot stood still."""

@@ -1,0 +1,1 @@
+"""An output of mapstream: a table of poses after each optimisation."""

@@ -1,0 +1,1 @@
+"""A pose source for mapstream: the robot's own odometry, with an uncertainty."""
