@@ -10,7 +10,7 @@ from mapstream.operators.operator import Operator, OperatorConfig
 from mapstream.streams import SE3, ImuBatch, LoopReport, Receiver, RelativePose, Sender, Submap
 from mapstream.streams.sync import anchored, window
 
-_COVARIANCE = np.diag([1e-8] * 3 + [1e-6] * 3)  # of no motion, rotation first [rad^2, m^2]
+_COVARIANCE = np.diag([1e-10] * 3 + [1e-8] * 3)  # of no motion, rotation first [rad^2, m^2]
 
 
 class StandstillConfig(OperatorConfig):

@@ -18,7 +18,7 @@ class DeadReckoningConfig(OperatorConfig):
     turn_per_turn: PositiveFloat = 0.02
     turn_per_m: PositiveFloat = 0.002  # [rad/m]
     slip: PositiveFloat = 0.01  # of the distance
-    least: PositiveFloat = 1e-4  # [rad] and [m]
+    least: PositiveFloat = 1e-3  # [rad] and [m]
 
 
 @dataclass(frozen=True)
