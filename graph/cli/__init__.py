@@ -28,7 +28,7 @@ VERBS = {  # verb -> function or group of commands, and what a list of verbs say
     "doctor": ("doctor:doctor", "Tell what is wrong with a recording."),
     "convert": ("convert:convert", "Convert data sets and bags to MCAP."),
     "simulate": ("simulate:simulate", "Make a synthetic recording with its truth inside."),
-    "map": ("maps:app", "Import, export, check, measure or optimise a map."),
+    "map": ("map:app", "Import, export, check, edit, merge or optimise a map."),
     "eval": ("evaluate:evaluate", "Compare a trajectory or map with a reference."),
     "check-plugin": ("plugins:check_plugin", "Check the operators of another package."),
 }

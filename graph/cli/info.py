@@ -22,7 +22,7 @@ def info(
 ) -> None:
     """Tell what is in a recording (topics, rates, what can be decoded) or in a map (missions, tables)."""
     if (path / _MANIFEST).is_file():
-        from mapstream.graph.cli.maps import print_statistics  # noqa: PLC0415  # pyarrow takes its time
+        from mapstream.graph.cli.map.look import print_statistics  # noqa: PLC0415  # pyarrow takes its time
 
         print_statistics(path, json=json)
         return

@@ -1,0 +1,34 @@
+"""`mapstream map DIR COMMAND`: the offline tools for maps, a module per group of verbs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from mapstream.graph.cli.map.files import export_, import_
+from mapstream.graph.cli.map.history import journal, redo, undo
+from mapstream.graph.cli.map.look import check, stats, view
+from mapstream.graph.cli.map.solve import optimize
+
+app = typer.Typer(
+    help="Work on a map: `mapstream map DIR COMMAND`.", no_args_is_help=True, rich_markup_mode=None
+)
+
+
+@app.callback()
+def _folder(context: typer.Context, folder: Annotated[Path, typer.Argument(metavar="DIR")]) -> None:
+    """Work on the map in a folder."""
+    context.obj = folder
+
+
+app.command("check")(check)
+app.command("stats")(stats)
+app.command("view")(view)
+app.command("journal")(journal)
+app.command("undo")(undo)
+app.command("redo")(redo)
+app.command("import")(import_)
+app.command("export")(export_)
+app.command("optimize")(optimize)

@@ -1,0 +1,86 @@
+"""What is in a map, and whether it keeps the rules: verbs that only look."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from mapstream.graph.cli.output import (
+    ExitCode,
+    JsonFlag,
+    complain,
+    in_place,
+    plain,
+    say,
+    say_json,
+    say_table,
+)
+from mapstream.operators.maps.statistics import map_statistics
+from mapstream.recordings.maps import check_map, load_map
+
+
+def check(context: typer.Context, *, json: JsonFlag = False) -> None:
+    """Check the map against every rule of the format; exits 1 if one is broken."""
+    folder: Path = context.obj
+    violations = check_map(load_map(folder), folder)
+    if json:
+        say_json({"path": folder, "violations": violations})
+    else:
+        for violation in violations:
+            complain(str(violation))
+        count = f"{len(violations)} violations" if violations else "no violations"
+        say(f"{in_place(folder)}: {count}")
+    if violations:
+        raise typer.Exit(ExitCode.FAILED)
+
+
+def stats(context: typer.Context, *, json: JsonFlag = False) -> None:
+    """Tell what is in the map: missions, lengths, edges, landmarks, files."""
+    print_statistics(context.obj, json=json)
+
+
+def print_statistics(folder: Path, *, json: bool) -> None:
+    """Print what is in a map."""
+    found = map_statistics(load_map(folder))
+    if json:
+        say_json({"path": folder, **plain(found)})
+        return
+    length = f"{found.length_m:.1f} m"
+    say(f"{in_place(folder)}: {len(found.missions)} missions, {length}, digest {found.digest[:16]}")
+    say_table(
+        ("mission", "name", "vertices", "duration s", "length m", "anchored"),
+        [
+            (
+                m.mission_id,
+                m.name,
+                m.num_vertices,
+                m.duration_s,
+                m.length_m,
+                "yes" if m.is_anchored else "no",
+            )
+            for m in found.missions
+        ],
+    )
+    say_table(
+        ("edges", "count", "between missions", "switched off"),
+        [(e.kind, e.count, e.num_between_missions, e.num_switched_off) for e in found.edges],
+    )
+    for what, counts in (("landmarks", found.landmarks), ("files", found.resources)):
+        if counts:
+            say_table((what, "count"), list(counts.items()))
+
+
+def view(
+    context: typer.Context,
+    *,
+    rerun: Annotated[str, typer.Option(help="spawn, connect[=URL] or save=FILE.")] = "spawn",
+) -> None:
+    """Show the map in Rerun: trajectories, loops by their switches, the cloud of all keyframes."""
+    from mapstream.graph.tap_map import view_map  # noqa: PLC0415  # rerun takes its time
+    from mapstream.graph.tap_sinks import SinkSpec  # noqa: PLC0415
+
+    folder: Path = context.obj
+    for note in view_map(load_map(folder), folder, SinkSpec.parse(rerun).open()):
+        complain(note)
