@@ -6,9 +6,8 @@ g2o knows numbers, not times: reading makes a vertex's number its stamp, and wri
 
 from __future__ import annotations
 
-import heapq
-from collections import Counter, defaultdict
-from dataclasses import replace
+from collections import Counter
+from dataclasses import fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -20,92 +19,113 @@ from mapstream.recordings.g2o_text import (
     format_g2o,
     parse_g2o,
 )
-from mapstream.recordings.maps.build import append_edges, new_mission
 from mapstream.recordings.maps.folder import write_whole
-from mapstream.recordings.maps.ids import mission_id
-from mapstream.recordings.maps.model import Map, vertex_ids
-from mapstream.recordings.maps.tables import BoolArray, Edges, Vertices
+from mapstream.recordings.maps.model import Map
+from mapstream.recordings.maps.tables import BoolArray, Edges
+from mapstream.recordings.pose_graph import ROBOT_SHIFT, PoseGraph, map_of, robots_of
 from mapstream.streams.errors import RecordingError
-from mapstream.streams.geometry import invert
 from mapstream.streams.messages.sensors import FloatArray, IntArray
 
 
-def read_g2o(path: Path | str) -> Map:
-    """Read a pose graph as a map of one mission; vertices without a line are placed along the edges.
+def read_g2o(*paths: Path | str, are_loops_switchable: bool = False) -> Map:
+    """Read the pose graph of these files; vertices without a line are placed along the edges.
 
+    Vertices with letters, as gtsam's symbols have, are of several robots: each becomes a mission, and the same
+    edge between two robots in the files of both counts once. Without letters, each file is a mission.
     Edges between following numbers are odometry, all others are loops; `FIX` is an edge of kind `fixed`.
 
+    Args:
+        paths: The files.
+        are_loops_switchable: Whether an optimizer may find loops within a mission false; those between
+            missions it may in any case.
+
     Raises:
-        RecordingError: If the file is not understood; the message has the file and the line.
+        RecordingError: If a file is not understood; the message has the file and the line.
     """
-    path = Path(path)
-    graph = parse_g2o(path)
-    poses = _placed(graph, path)
-    numbers = np.array(sorted(poses), dtype=np.int64)
-    mission = mission_id(path.name)
-    vertices = Vertices(
-        id=vertex_ids(mission, numbers),
-        mission=np.zeros(len(numbers), dtype=np.int64),
-        stamp_ns=numbers,
-        T_mission_base=np.array([poses[number] for number in numbers.tolist()]),
-    )
-    map_ = replace(new_mission(Map.empty(), mission, name=path.name), vertices=vertices)
-    map_ = append_edges(map_, _relative_edges(graph, numbers, path))
-    fixed = np.searchsorted(numbers, graph.fixed)
-    return append_edges(map_, _fixed_edges(fixed, vertices.T_mission_base[fixed]))
+    files = [Path(path) for path in paths]
+    texts = [parse_g2o(path) for path in files]
+    has_letters = any(robots_of(_keys(text)).any() for text in texts)
+    if not has_letters:
+        texts = [_of_robot(text, robot) for robot, text in enumerate(texts)]
+    graphs = [_pose_graph(*each) for each in zip(texts, files, strict=True)]
+    graph = _joined(graphs)
+    is_loop = np.abs(graph.ends[:, 1] - graph.ends[:, 0]) != 1
+    if are_loops_switchable:
+        graph = replace(graph, is_switchable=is_loop)
+    try:
+        return map_of(graph, _names(texts, files, has_letters=has_letters), "g2o")
+    except RecordingError as error:
+        raise RecordingError(f"{', '.join(map(str, files))}: {error}") from error
 
 
-def _placed(graph: G2oGraph, path: Path) -> dict[int, FloatArray]:
-    """Return a pose for every vertex; those without one follow from edges between near numbers first."""
-    ends: list[tuple[int, int]] = [(a, b) for a, b in graph.ends.tolist()]
-    neighbours: dict[int, list[int]] = defaultdict(list)
-    for index, (a, b) in enumerate(ends):
-        neighbours[a].append(index)
-        neighbours[b].append(index)
-    given = zip(graph.numbers.tolist(), graph.poses, strict=True)
-    poses: dict[int, FloatArray] = dict(given) or {min(neighbours): np.eye(4)}
-    found = list(poses)
-    leads: list[tuple[int, int]] = []  # edges from a known vertex, by the distance of their numbers
-    while found or leads:
-        for vertex in found:
-            for index in neighbours[vertex]:
-                heapq.heappush(leads, (abs(ends[index][0] - ends[index][1]), index))
-        found = []
-        if leads:
-            _, index = heapq.heappop(leads)
-            a, b = ends[index]
-            if b not in poses:
-                poses[b] = poses[a] @ graph.T_a_b[index]
-                found = [b]
-            elif a not in poses:
-                poses[a] = poses[b] @ invert(graph.T_a_b[index])
-                found = [a]
-    if lost := sorted((neighbours.keys() | set(graph.fixed.tolist())) - poses.keys()):
-        raise RecordingError(f"{path}: no line places vertex {lost[0]}, and no edge leads there")
-    return poses
+def _keys(text: G2oGraph) -> IntArray:
+    """Return the keys of all vertices of a file."""
+    return np.unique(np.concatenate([text.numbers, text.ends.ravel(), text.fixed]))
 
 
-def _relative_edges(graph: G2oGraph, numbers: IntArray, path: Path) -> Edges:
-    a, b = graph.ends.T
-    return Edges(
-        kind=np.where(np.abs(b - a) == 1, "odometry", "loop").astype(object),
-        vertex_a=np.searchsorted(numbers, a),
-        vertex_b=np.searchsorted(numbers, b),
-        T_a_b=graph.T_a_b,
-        covariance=_covariances(graph, path),
-        source=np.full(len(a), "g2o", dtype=object),
+def _of_robot(text: G2oGraph, robot: int) -> G2oGraph:
+    """Return the file's graph with keys of this robot."""
+    first = robot << ROBOT_SHIFT
+    return replace(
+        text, numbers=text.numbers + first, ends=text.ends + first, fixed=text.fixed + first
     )
 
 
-def _fixed_edges(rows: IntArray, T_map_base: FloatArray) -> Edges:
-    return Edges(
-        kind=np.full(len(rows), "fixed", dtype=object),
-        vertex_a=rows,
-        vertex_b=np.full(len(rows), -1),
-        T_a_b=T_map_base,
-        covariance=np.zeros((len(rows), 6, 6)),
-        source=np.full(len(rows), "g2o", dtype=object),
+def _names(texts: list[G2oGraph], files: list[Path], *, has_letters: bool) -> dict[int, str]:
+    """Return a name for each robot: of the file where its vertices are, and its letter."""
+    are_unique = len({path.name for path in files}) == len(files)
+    names: dict[int, str] = {}
+    for keys_of in (lambda text: text.numbers, _keys):
+        for text, path in zip(texts, files, strict=True):
+            name = path.name if are_unique else f"{path.parent.name}/{path.name}"
+            for robot in np.unique(robots_of(keys_of(text))).tolist():
+                names.setdefault(robot, f"{name} {_letter(robot)}" if has_letters else name)
+    return names
+
+
+def _letter(robot: int) -> str:
+    return chr(robot) if chr(robot).isprintable() else str(robot)
+
+
+def _pose_graph(text: G2oGraph, path: Path) -> PoseGraph:
+    robots = robots_of(text.ends)
+    return PoseGraph(
+        keys=text.numbers,
+        poses=text.poses,
+        ends=text.ends,
+        T_a_b=text.T_a_b,
+        covariance=_covariances(text, path),
+        is_switchable=robots[:, 0] != robots[:, 1],
+        fixed=text.fixed,
     )
+
+
+def _joined(graphs: list[PoseGraph]) -> PoseGraph:
+    """Return one graph; a vertex has its first pose, and edges in several files count once."""
+    if len(graphs) == 1:
+        return graphs[0]
+    columns = {
+        each.name: np.concatenate([getattr(graph, each.name) for graph in graphs])
+        for each in fields(PoseGraph)
+    }
+    _, first = np.unique(columns["keys"], return_index=True)
+    columns["keys"], columns["poses"] = columns["keys"][first], columns["poses"][first]
+    of_file = np.repeat(np.arange(len(graphs)), [len(graph.ends) for graph in graphs])
+    once = _first_files(columns["ends"], columns["T_a_b"], of_file)
+    for name in ("ends", "T_a_b", "covariance", "is_switchable"):
+        columns[name] = columns[name][once]
+    columns["fixed"] = np.unique(columns["fixed"])
+    return PoseGraph(**columns)
+
+
+def _first_files(ends: IntArray, T_a_b: FloatArray, of_file: IntArray) -> BoolArray:
+    """Return where an edge is in the first file that has it."""
+    identity = [row.tobytes() + T.tobytes() for row, T in zip(ends, T_a_b, strict=True)]
+    first: dict[bytes, int] = {}
+    for each, file in zip(identity, of_file.tolist(), strict=True):
+        first.setdefault(each, file)
+    is_first: BoolArray = np.array([first[each] for each in identity], dtype=np.int64) == of_file
+    return is_first
 
 
 def _covariances(graph: G2oGraph, path: Path) -> FloatArray:

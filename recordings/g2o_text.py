@@ -96,6 +96,10 @@ def _parsed(tag: str, words: list[str], number: int, path: Path) -> _Line:
         )
     except ValueError as error:
         raise RecordingError(f"{where}: {error}") from error
+    if not all(0 <= i < 1 << 63 for i in line.ids):
+        raise RecordingError(
+            f"{where}: expected numbers of vertices from 0 to 2^63, got {line.ids}"
+        )
     if not all(map(math.isfinite, line.values)):
         raise RecordingError(f"{where}: a value is not finite")
     is_rotation = tag.endswith("QUAT")

@@ -1,8 +1,8 @@
-"""Maps from files of other tools; the suffix of the file chooses the format."""
+"""Maps from files of other tools; the suffix of the file chooses the format, or a name in front of it."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,7 +11,9 @@ from pydantic import PositiveFloat
 
 from mapstream.operators.operator import OperatorConfig
 from mapstream.recordings.g2o import read_g2o
+from mapstream.recordings.kimera_multi import read_kimera_multi
 from mapstream.recordings.maps.build import append_edges, new_mission
+from mapstream.recordings.maps.combine import merge_maps
 from mapstream.recordings.maps.ids import mission_id
 from mapstream.recordings.maps.model import Map, vertex_ids
 from mapstream.recordings.maps.tables import Edges, Vertices
@@ -22,23 +24,47 @@ from mapstream.streams.trajectory import Trajectory
 
 
 class ImportConfig(OperatorConfig):
-    """What the edges of an imported trajectory are worth, for one step."""
+    """What the edges of imported trajectories and pose graphs are worth."""
 
     rotation_sigma_rad: PositiveFloat = 0.01
+    """Of one step of a trajectory."""
     translation_sigma_m: PositiveFloat = 0.05
+    """Of one step of a trajectory."""
+    are_loops_switchable: bool = False
+    """Whether an optimizer may find loops within a mission of a g2o graph false."""
 
 
-def import_map(path: Path, config: ImportConfig) -> Map:
-    """Read a `.g2o` graph, or a `.tum`, `.kitti` or `.csv` (EuRoC) trajectory with odometry edges.
+def import_map(sources: Sequence[str | Path], config: ImportConfig) -> Map:
+    """Read pose graphs and trajectories, each of which becomes a mission or several.
+
+    Args:
+        sources: Each a file whose suffix tells the format, or `FORMAT:PATH` with a name from `IMPORTERS`.
+            Several g2o files are one graph (see `read_g2o`); whatever else there are several of is merged.
+        config: What trajectories are worth.
 
     Raises:
-        MapError: If the suffix is of no known format.
-        RecordingError: If the file is not understood; the message has the line.
+        MapError: If a format is not known, or two files are one mission.
+        RecordingError: If a file is not understood; the message has the line.
     """
-    read = IMPORTERS.get(path.suffix.lower())
-    if read is None:
-        raise MapError(f"{path}: unknown format {path.suffix!r}; known are {', '.join(IMPORTERS)}")
-    return read(path, config)
+    files: dict[str, list[Path]] = {}
+    for source in sources:
+        name, path = _parsed(str(source))
+        files.setdefault(name, []).append(path)
+    return merge_maps(
+        [map_ for name, paths in files.items() for map_ in IMPORTERS[name](paths, config)]
+    )
+
+
+def _parsed(source: str) -> tuple[str, Path]:
+    """Return the name of the format and the path."""
+    name, colon, rest = source.partition(":")
+    if colon and name in IMPORTERS:
+        return name, Path(rest)
+    suffix = Path(source).suffix.lower()
+    if suffix not in _BY_SUFFIX:
+        known = f"suffixes {', '.join(_BY_SUFFIX)}; or {', '.join(f'{n}:' for n in IMPORTERS)}"
+        raise MapError(f"{source}: unknown format {suffix!r}; known are {known}")
+    return _BY_SUFFIX[suffix], Path(source)
 
 
 def trajectory_map(trajectory: Trajectory, name: str, config: ImportConfig) -> Map:
@@ -64,25 +90,27 @@ def trajectory_map(trajectory: Trajectory, name: str, config: ImportConfig) -> M
     return append_edges(map_, edges)
 
 
-def _g2o(path: Path, config: ImportConfig) -> Map:  # noqa: ARG001  # g2o has its own covariances
-    return read_g2o(path)
+def _g2o(paths: Sequence[Path], config: ImportConfig) -> list[Map]:
+    return [read_g2o(*paths, are_loops_switchable=config.are_loops_switchable)]
 
 
-def _tum(path: Path, config: ImportConfig) -> Map:
-    return trajectory_map(read_tum(path), path.name, config)
+def _kimera_multi(paths: Sequence[Path], config: ImportConfig) -> list[Map]:  # noqa: ARG001  # it has its own covariances
+    return [read_kimera_multi(path) for path in paths]
 
 
-def _kitti(path: Path, config: ImportConfig) -> Map:
-    return trajectory_map(read_kitti(path), path.name, config)
+def _trajectories(read: Callable[[Path], Trajectory]) -> Importer:
+    def import_(paths: Sequence[Path], config: ImportConfig) -> list[Map]:
+        return [trajectory_map(read(path), path.name, config) for path in paths]
+
+    return import_
 
 
-def _euroc(path: Path, config: ImportConfig) -> Map:
-    return trajectory_map(read_euroc(path), path.name, config)
-
-
-IMPORTERS: dict[str, Callable[[Path, ImportConfig], Map]] = {
-    ".tum": _tum,
-    ".kitti": _kitti,
-    ".csv": _euroc,
-    ".g2o": _g2o,
+Importer = Callable[[Sequence[Path], ImportConfig], list[Map]]
+IMPORTERS: dict[str, Importer] = {
+    "tum": _trajectories(read_tum),
+    "kitti": _trajectories(read_kitti),
+    "euroc": _trajectories(read_euroc),
+    "g2o": _g2o,
+    "kimera-multi": _kimera_multi,
 }
+_BY_SUFFIX = {".tum": "tum", ".kitti": "kitti", ".csv": "euroc", ".g2o": "g2o"}

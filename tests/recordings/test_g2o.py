@@ -15,6 +15,7 @@ from mapstream.streams.geometry import invert, se3_log
 from tests.data import shared
 from tests.recordings.made_maps import full_map, line_map
 
+PRECISE = "100 0 0 100 0 100"  # an information matrix
 GRAPHS = ["tinyGrid3D", "smallGrid3D", "MIT", "CSAIL", "intel"]
 
 
@@ -114,11 +115,13 @@ def test_directions_without_information_are_infinite(tmp_path: Path) -> None:
 
 def test_a_map_in_space_round_trips_and_names_what_it_leaves_out(tmp_path: Path) -> None:
     map_ = full_map()
-    off = replace(map_.edges, switch=np.array([1.0, 0.1, *[1.0] * 8]))
+    switch = np.ones(len(map_.edges))
+    switch[1] = 0.1
+    off = replace(map_.edges, switch=switch)
 
     left_out = write_g2o(replace(map_, edges=off), tmp_path / "map.g2o")
 
-    assert left_out == {"imu": 5, "odometry": 1}
+    assert left_out == {"imu": 5, "odometry": 1, "absolute": 1}
     again = read_g2o(tmp_path / "map.g2o")
     np.testing.assert_allclose(
         again.vertices.T_mission_base, map_.vertices.T_mission_base, atol=1e-12
@@ -150,3 +153,58 @@ def test_a_missing_file_is_named(tmp_path: Path) -> None:
         read_g2o(tmp_path / "no.g2o")
     with pytest.raises(RecordingError, match="cannot be written"):
         write_g2o(line_map(2), tmp_path / "no" / "map.g2o")
+
+
+def test_S3_several_files_are_several_missions(tmp_path: Path) -> None:
+    """Without letters numbers clash, and each file is a mission; files of one name tell their folders."""
+    for folder in ("one", "two"):
+        (tmp_path / folder).mkdir()
+        (tmp_path / folder / "graph.g2o").write_text(f"EDGE_SE2 0 1 1 0 0 {PRECISE}\n")
+
+    map_ = read_g2o(tmp_path / "one/graph.g2o", tmp_path / "two/graph.g2o")
+
+    assert map_.missions.name.tolist() == ["one/graph.g2o", "two/graph.g2o"]
+    assert map_.missions.is_base_frame_known.tolist() == [True, False]
+    assert map_.edges.vertex_a.tolist() == [0, 2]
+    assert map_.edges.kind.tolist() == ["odometry", "odometry"]
+    assert check_map(map_) == []
+
+
+def test_S3_letters_are_robots_and_a_loop_in_both_files_counts_once(tmp_path: Path) -> None:
+    a, b = ord("a") << 56, ord("b") << 56
+    loop = f"EDGE_SE2 {a + 1} {b} 5 0 0 {PRECISE}"
+    robots = {
+        "0.g2o": [f"EDGE_SE2 {a} {a + 1} 1 0 0 {PRECISE}", loop],
+        "1.g2o": [f"EDGE_SE2 {b} {b + 1} 2 0 0 {PRECISE}", loop, f"FIX {b}"],
+    }
+    for name, lines in robots.items():
+        (tmp_path / name).write_text("\n".join(lines))
+
+    map_ = read_g2o(tmp_path / "0.g2o", tmp_path / "1.g2o")
+
+    assert map_.missions.name.tolist() == ["0.g2o a", "0.g2o b"]
+    assert map_.vertices.stamp_ns.tolist() == [0, 1, 0, 1]
+    assert map_.vertices.T_mission_base[:, 0, 3].tolist() == [0, 1, 0, 2]
+    assert map_.edges.kind.tolist() == ["odometry", "loop", "odometry", "fixed"]
+    assert map_.edges.is_switchable.tolist() == [False, True, False, False]
+    assert check_map(map_) == []
+
+
+@pytest.mark.parametrize(
+    ("folder", "num_vertices", "num_loops"),
+    [("clean/example_4robots", 440, 87), ("spoiled/example_2robots", 284, 31)],
+)
+def test_S3_a_simulated_team_is_read_from_the_files_of_its_robots(
+    folder: str, num_vertices: int, num_loops: int
+) -> None:
+    files = sorted((shared("multirobot_argos") / folder).glob("*.g2o"))
+
+    map_ = read_g2o(*files)
+
+    assert len(map_.missions) == len(files)
+    assert len(map_.vertices) == num_vertices
+    loops = map_.edges_of("loop")
+    assert len(loops) == num_loops
+    missions = map_.vertices.mission[[map_.edges.vertex_a[loops], map_.edges.vertex_b[loops]]]
+    np.testing.assert_array_equal(map_.edges.is_switchable[loops], missions[0] != missions[1])
+    assert check_map(map_) == []
