@@ -12,6 +12,7 @@ from pydantic import BaseModel, ValidationError
 from mapstream.recordings.mcap_whole import whole_mcap
 from mapstream.recordings.worlds.simulation import Simulation
 from mapstream.recordings.worlds.w_lid import WLidConfig, w_lid
+from mapstream.recordings.worlds.w_pan import WPanConfig, w_pan
 from mapstream.streams.errors import ConfigError
 
 
@@ -26,6 +27,7 @@ class World:
 
 WORLDS = {
     "w_lid": World("a loop of corridors, LiDAR, IMU, drifting odometry", WLidConfig, w_lid),
+    "w_pan": World("a room, a depth camera that pans and tilts, /tf", WPanConfig, w_pan),
 }
 
 
