@@ -1,6 +1,7 @@
 """World W-PAN: repeatable, and only its transforms say where the camera sits."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -9,7 +10,7 @@ from mapstream.recordings.worlds.catalogue import simulate
 from mapstream.recordings.worlds.w_pan import WPanConfig, w_pan
 from mapstream.streams.messages.sensors import LidarScan
 
-SMALL = {"duration_s": 0.5, "camera": {"columns": 8, "rows": 6}}
+SMALL: dict[str, Any] = {"duration_s": 0.5, "camera": {"columns": 8, "rows": 6}}
 
 
 def test_the_same_seed_gives_the_same_bytes(tmp_path: Path) -> None:
