@@ -49,9 +49,19 @@ class Fields:
             ConfigError: If it cannot be read, is no YAML, or is no mapping.
         """
         try:
-            node = YAML(typ="safe", pure=True).compose(path.read_text(encoding="utf-8"))
+            return cls.of_bytes(path.read_bytes(), path)
         except OSError as error:
             raise ConfigError(f"{path}: cannot be read: {error.strerror}") from error
+
+    @classmethod
+    def of_bytes(cls, content: bytes, path: Path) -> Fields:
+        """Read what is or might be such a file; the path is for messages.
+
+        Raises:
+            ConfigError: If it is no YAML, or no mapping.
+        """
+        try:
+            node = YAML(typ="safe", pure=True).compose(content.decode("utf-8"))
         except (YAMLError, UnicodeDecodeError) as error:
             mark = getattr(error, "problem_mark", None)
             line = "" if mark is None else f":{mark.line + 1}"

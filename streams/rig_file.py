@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping
+from io import BytesIO
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -52,7 +53,19 @@ def load_rig(path: Path) -> Rig:
     Raises:
         ConfigError: If the file is unreadable or wrong; the message has the file, the line, the key.
     """
-    top = Fields.of_file(path)
+    return _rig_of(Fields.of_file(path), path)
+
+
+def parse_rig(content: bytes, path: Path) -> Rig:
+    """Read the bytes of a sensor file; the path is for messages.
+
+    Raises:
+        ConfigError: If they are wrong; the message has the path, the line, the key.
+    """
+    return _rig_of(Fields.of_bytes(content, path), path)
+
+
+def _rig_of(top: Fields, path: Path) -> Rig:
     sensors = [_sensor(fields) for fields in top.items("sensors")]
     extrinsics = []
     for fields in top.items("extrinsics"):
@@ -77,13 +90,19 @@ def write_rig(rig: Rig, path: Path) -> None:
     Raises:
         OSError: If it cannot be written; an older file is then left as it was.
     """
+    partial = path.with_name(f".{path.name}.partial")
+    partial.write_bytes(format_rig(rig))
+    partial.replace(path)
+
+
+def format_rig(rig: Rig) -> bytes:
+    """Return the content of a sensor file that loads equal."""
     yaml = YAML(typ="safe", pure=True)
     yaml.default_flow_style = None
     yaml.sort_base_mapping_type_on_output = False  # type: ignore[assignment]  # its stub says None
-    partial = path.with_name(f".{path.name}.partial")
-    with partial.open("w", encoding="utf-8") as file:
-        yaml.dump(rig_document(rig), file)
-    partial.replace(path)
+    content = BytesIO()
+    yaml.dump(rig_document(rig), content)
+    return content.getvalue()
 
 
 def _warn_of_unread(fields: Fields) -> None:

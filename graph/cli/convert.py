@@ -16,7 +16,9 @@ def convert(
     source: Annotated[
         str,
         typer.Argument(
-            help="KIND:PATH. " + ". ".join(f"{k}: {c.summary}" for k, c in CONVERTERS.items()) + "."
+            help="KIND:PATH, or KIND alone where the data is installed. "
+            + ". ".join(f"{k}: {c.summary}" for k, c in CONVERTERS.items())
+            + "."
         ),
     ],
     out: Annotated[Path, typer.Argument(help="The MCAP file to write.")],

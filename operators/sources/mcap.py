@@ -20,6 +20,7 @@ from mapstream.operators.sources.mcap_config import McapSourceConfig
 from mapstream.operators.sources.playback import Playback
 from mapstream.operators.sources.stamps import StampWatch
 from mapstream.operators.sources.topic_reader import Played, Reading, TopicReader
+from mapstream.recordings.attached_rig import attached_rig
 from mapstream.recordings.decoding import Decoder, decoder_for
 from mapstream.recordings.recording import Recording, check_topics, open_recording
 from mapstream.streams.errors import DecodeError
@@ -88,7 +89,8 @@ class McapSource(DynamicPorts, Operator[NoPorts, Ports]):
         config = self.config
         wanted = {port: config.topic(port) for port in config.topics}
         check_topics(config.path, [topic.topic for topic in wanted.values()], recording.topics)
-        rig = load_rig(config.rig) if config.rig else Rig(base_frame="base_link")
+        rig = load_rig(config.rig) if config.rig else attached_rig(recording)
+        rig = rig or Rig(base_frame="base_link")
         base_frame = config.base_frame or rig.base_frame
         self._extrinsics = Extrinsics(recording, config.transforms, rig.transforms, base_frame)
         return {

@@ -10,6 +10,7 @@ from pydantic import Field, NonNegativeFloat, PositiveFloat, field_validator
 from mapstream.operators.operator import OperatorConfig
 from mapstream.recordings.message_codec import known_messages
 from mapstream.streams.calibration import CameraCalibration
+from mapstream.streams.messages.constraints import Constraint
 from mapstream.streams.messages.estimates import Odometry, PointCloud
 from mapstream.streams.messages.sensors import (
     CameraFrame,
@@ -34,6 +35,7 @@ _TYPES: dict[str, type[Any]] = {  # by the name of a port
     "clouds": PointCloud,
     "transforms": TransformBatch,
     "calibrations": CameraCalibration,
+    "constraints": Constraint,
 }
 
 
@@ -69,7 +71,8 @@ class McapSourceConfig(OperatorConfig):
         description="port: topic, or port: {topic, type, offset_s, stamp, frame}"
     )
     rig: Path | None = Field(
-        default=None, description="a sensor file: places, frames, time offsets"
+        default=None,
+        description="a sensor file: places, frames, time offsets; the one in the recording, if it has one",
     )
     base_frame: str | None = Field(
         default=None, description="the robot's frame on `transforms`; the rig's, or base_link"

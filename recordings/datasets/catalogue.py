@@ -8,6 +8,7 @@ from pathlib import Path
 
 from mapstream.recordings.datasets.conversion import Convert, Notices, Progress
 from mapstream.recordings.datasets.kitti import convert_kitti
+from mapstream.recordings.datasets.kitti_inertial import convert_kitti_inertial, gtsam_data
 from mapstream.recordings.datasets.lidar_bins import convert_lidar_bins
 from mapstream.recordings.mcap_whole import whole_mcap
 from mapstream.recordings.mcap_writer import McapWriter
@@ -24,6 +25,7 @@ class Converter:
 
     summary: str
     convert: Convert
+    installed: Callable[[], Path] | None = None  # where the source is if no path is given
 
 
 def convert_tum(source: Path, writer: McapWriter, on_progress: Progress) -> Notices:
@@ -48,6 +50,11 @@ def convert_rosbag(source: Path, writer: McapWriter, on_progress: Progress) -> N
 
 CONVERTERS = {
     "kitti": Converter("folder of KITTI odometry scans", convert_kitti),
+    "kitti00-gtsam": Converter(
+        "470 s of IMU and GPS from the installed gtsam; needs no PATH",
+        convert_kitti_inertial,
+        gtsam_data,
+    ),
     "lidar_bins": Converter("folder of deskewed scans with alidarPose.csv", convert_lidar_bins),
     "rosbag": Converter("ROS 1 bag, rosbag2 or MCAP", convert_rosbag),
     "tum": Converter("TUM trajectory", convert_tum),
@@ -69,7 +76,8 @@ def convert(
     """Rewrite a data set as MCAP; the file is there whole or not at all.
 
     Args:
-        spec: Kind and place, as `kitti:DIR`; kinds are the keys of `CONVERTERS`.
+        spec: Kind and place, as `kitti:DIR`; kinds are the keys of `CONVERTERS`. Without a place where the
+            source is installed.
         out: The file to write; one that exists is replaced.
         on_progress: Called with the fraction done.
 
@@ -77,13 +85,23 @@ def convert(
         ConfigError: If the kind is unknown, or there is nothing at the place.
         RecordingError: If the source cannot be read, or the file not be written.
     """
-    kind, colon, place = spec.partition(":")
-    if not colon or kind not in CONVERTERS:
-        kinds = ", ".join(f"{name}:PATH" for name in CONVERTERS)
-        raise ConfigError(f"{spec!r} is no source to convert; expected one of {kinds}")
-    source, out = Path(place), Path(out)
+    converter, source = _parsed(spec)
+    out = Path(out)
     if not source.exists():
         raise ConfigError(f"{spec}: there is nothing at {source}")
     with whole_mcap(out) as writer:
-        notices = CONVERTERS[kind].convert(source, writer, on_progress or (lambda _: None))
+        notices = converter.convert(source, writer, on_progress or (lambda _: None))
     return Conversion(out, writer.num_messages, notices)
+
+
+def _parsed(spec: str) -> tuple[Converter, Path]:
+    kind, colon, place = spec.partition(":")
+    converter = CONVERTERS.get(kind)
+    if converter is not None and colon:
+        return converter, Path(place)
+    if converter is not None and converter.installed is not None:
+        return converter, converter.installed()
+    kinds = ", ".join(
+        f"{name}:PATH" if found.installed is None else name for name, found in CONVERTERS.items()
+    )
+    raise ConfigError(f"{spec!r} is no source to convert; expected one of {kinds}")
