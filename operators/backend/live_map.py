@@ -12,9 +12,10 @@ from mapstream.operators.estimation.batch import (
     OptimizeConfig,
     optimize_map,
 )
-from mapstream.operators.estimation.factors import Factor, fixed, make_factors
+from mapstream.operators.estimation.fixing import fixed
 from mapstream.operators.estimation.incremental import IncrementalProblem
-from mapstream.operators.estimation.noise import NoiseModels
+from mapstream.operators.estimation.kinds import make_factors
+from mapstream.operators.estimation.noise import Factor, NoiseModels
 from mapstream.operators.estimation.symbols import PoseSymbols
 from mapstream.recordings.maps.build import add_edges, anchored, append_submap
 from mapstream.recordings.maps.model import Map
@@ -114,7 +115,7 @@ class LiveMap:
 
     def _factors(self, first_edge: int) -> dict[int, Factor]:
         rows = range(first_edge, len(self.map.edges))
-        return make_factors(self.map.edges, rows, self._noise_of)
+        return make_factors(self.map, rows, self._noise_of)
 
     def _take_poses(self) -> None:
         T_mission_map = invert(self.map.missions.T_map_mission)
@@ -128,7 +129,7 @@ class LiveMap:
         edges = self.map.edges
         is_true = ~edges.is_switchable | (edges.switch >= 0.5)
         rows = np.flatnonzero(is_true).tolist()
-        factors = make_factors(edges, rows, self._noise_of)
+        factors = make_factors(self.map, rows, self._noise_of)
         poses = self.map.T_map_base(np.arange(len(self.map.vertices)))
         for row in range(len(self.map.missions)):
             first = int(self.map.vertices_of(row)[0])

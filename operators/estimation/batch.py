@@ -17,18 +17,12 @@ import gtsam
 import numpy as np
 from pydantic import BaseModel, ConfigDict, PositiveFloat, PositiveInt
 
-from mapstream.operators.estimation.factors import (
-    MAKERS,
-    Factor,
-    fixed,
-    make_factors,
-    poses_from,
-    values_from,
-)
-from mapstream.operators.estimation.noise import NoiseModels, switch_of, switchable
+from mapstream.operators.estimation.fixing import fixed
+from mapstream.operators.estimation.kinds import make_factors, makers
+from mapstream.operators.estimation.noise import Factor, NoiseModels, switch_of, switchable
+from mapstream.operators.estimation.states import poses_from, values_from, with_solution
 from mapstream.recordings.maps.model import Map
 from mapstream.streams.errors import EstimationError
-from mapstream.streams.geometry import invert
 from mapstream.streams.messages.sensors import FloatArray, IntArray
 
 _ANNEALING = 4.0  # each round makes the robust cost this much less convex
@@ -102,12 +96,12 @@ class _Problem:
         self.config = config
         edges = map_.edges
         self.poses = map_.T_map_base(np.arange(len(map_.vertices)))
-        takes_part = np.isin(edges.kind, list(MAKERS))
+        takes_part = np.isin(edges.kind, list(makers()))
         if config.kinds is not None:
             takes_part &= np.isin(edges.kind, config.kinds)
         left_out = edges.kind[~takes_part].astype(str)
         self.ignored = {str(k): int((left_out == k).sum()) for k in np.unique(left_out)}
-        factors = make_factors(edges, np.flatnonzero(takes_part).tolist(), NoiseModels())
+        factors = make_factors(map_, np.flatnonzero(takes_part), NoiseModels())
         may_switch = edges.is_switchable if config.is_robust else np.zeros(len(edges), bool)
         self.loops = {row: f for row, f in factors.items() if may_switch[row]}
         self.plain = {row: f for row, f in factors.items() if not may_switch[row]}
@@ -198,22 +192,11 @@ def _anchors(map_: Map, edge_rows: IntArray) -> list[int]:
 
 
 def _with_solution(map_: Map, poses: FloatArray, switches: dict[int, float]) -> Map:
-    """Return the map with poses in their missions; a guessed base frame moves with its first vertex."""
-    frames = map_.missions.T_map_mission.copy()
-    for row in np.flatnonzero(~map_.missions.is_base_frame_known):
-        vertices = map_.vertices_of(int(row))
-        if len(vertices):
-            first = vertices[0]
-            frames[row] = poses[first] @ invert(map_.vertices.T_mission_base[first])
-    in_mission = invert(frames)[map_.vertices.mission] @ poses
+    """Return the map with new poses and switches."""
+    map_ = with_solution(map_, values_from(poses))
     switch = map_.edges.switch.copy()
     switch[list(switches)] = list(switches.values())
-    return replace(
-        map_,
-        missions=replace(map_.missions, T_map_mission=frames),
-        vertices=replace(map_.vertices, T_mission_base=in_mission),
-        edges=replace(map_.edges, switch=switch),
-    )
+    return replace(map_, edges=replace(map_.edges, switch=switch))
 
 
 def describe_failure(error: RuntimeError, map_: Map) -> str:

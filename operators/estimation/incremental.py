@@ -11,7 +11,8 @@ from typing import Any
 import gtsam
 import numpy as np
 
-from mapstream.operators.estimation.factors import Factor, poses_from, values_from
+from mapstream.operators.estimation.noise import Factor
+from mapstream.operators.estimation.states import poses_from, values_from
 from mapstream.streams.errors import EstimationError
 from mapstream.streams.messages.sensors import FloatArray
 

@@ -10,6 +10,8 @@ import numpy as np
 from mapstream.streams.errors import EstimationError
 from mapstream.streams.messages.sensors import FloatArray
 
+Factor = Any  # gtsam has no types
+
 
 def noise_from_covariance(covariance: FloatArray) -> Any:  # noqa: ANN401  # gtsam has no types
     """Return the noise model of a covariance (6, 6), rotation first [rad, m].
