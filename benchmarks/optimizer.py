@@ -13,8 +13,9 @@ import scipy.sparse.csgraph  # noqa: F401  # imported when first needed: not wha
 from benchmarks.table import Row, markdown
 from mapstream.operators.backend.live_map import LiveMap
 from mapstream.operators.estimation.batch import OptimizeConfig, optimize_map
-from mapstream.recordings.maps.build import add_edges, append_submap
+from mapstream.recordings.maps.build import add_edges
 from mapstream.recordings.maps.model import Map
+from mapstream.recordings.maps.submaps import append_submap
 from mapstream.streams.geometry import SE3, se3_exp
 from mapstream.streams.messages.estimates import Keyframe, Odometry, RelativePose, Submap
 

@@ -17,8 +17,9 @@ from mapstream.operators.estimation.incremental import IncrementalProblem
 from mapstream.operators.estimation.kinds import make_factors
 from mapstream.operators.estimation.noise import Factor, NoiseModels
 from mapstream.operators.estimation.symbols import PoseSymbols
-from mapstream.recordings.maps.build import add_edges, anchored, append_submap
+from mapstream.recordings.maps.build import add_edges, anchored
 from mapstream.recordings.maps.model import Map
+from mapstream.recordings.maps.submaps import append_submap
 from mapstream.streams.errors import EstimationError
 from mapstream.streams.geometry import SE3, invert
 from mapstream.streams.messages.estimates import MapCorrection, RelativePose, Submap

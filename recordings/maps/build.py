@@ -1,23 +1,23 @@
-"""How maps grow: missions, submaps, edges, poses, resources. Every function returns a new map."""
+"""How maps grow: missions, edges, poses, resources. Every function returns a new map."""
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from mapstream.recordings.maps.ids import derived_id, id_array, id_bytes, vertex_id
+from mapstream.recordings.maps.ids import derived_id, id_array, id_bytes
 from mapstream.recordings.maps.model import Map
 from mapstream.recordings.maps.rows import concatenate, take
-from mapstream.recordings.maps.tables import Edges, Missions, Resources, Vertices
+from mapstream.recordings.maps.tables import Edges, Missions, Resources
 from mapstream.streams.errors import MapError
 from mapstream.streams.geometry import SE3
-from mapstream.streams.messages.estimates import Keyframe, RelativePose, Submap
-from mapstream.streams.messages.sensors import FloatArray, IntArray, RecordRef
+from mapstream.streams.messages.estimates import RelativePose
+from mapstream.streams.messages.sensors import IntArray, RecordRef
 
 
 def new_mission(map_: Map, mission_id: str, *, name: str = "", sensors: str = "{}") -> Map:
@@ -38,69 +38,6 @@ def new_mission(map_: Map, mission_id: str, *, name: str = "", sensors: str = "{
         sensors=np.array([sensors], dtype=object),
     )
     return replace(map_, missions=concatenate([map_.missions, mission]))
-
-
-def append_submap(map_: Map, submap: Submap, *, mission_name: str = "") -> Map:
-    """Return the map with a submap's keyframes, edges and references at the end of its mission.
-
-    The first keyframe of every submap but the first is the mission's newest vertex and is not added again.
-    From there on odometry is carried on, so that the new vertices follow a mission that was optimised.
-
-    Raises:
-        MapError: If the submap is not the next one of its mission, or an edge ends outside the mission.
-    """
-    known = [map_.mission_id(row) for row in range(len(map_.missions))]
-    if submap.mission_id not in known:
-        map_ = new_mission(map_, submap.mission_id, name=mission_name)
-    mission_row = map_.mission_row(submap.mission_id)
-    T_mission_odom = _continued(map_, mission_row, submap)
-    added = submap.keyframes[1:] if len(map_.vertices_of(mission_row)) else submap.keyframes
-    first_new = len(map_.vertices)
-    vertices = _vertices(added, id_bytes(submap.mission_id), mission_row, T_mission_odom)
-    map_ = replace(map_, vertices=concatenate([map_.vertices, vertices]))
-    records = [(first_new + at, r) for at, keyframe in enumerate(added) for r in keyframe.records]
-    return add_edges(add_records(map_, records), submap.edges)
-
-
-def _continued(map_: Map, mission_row: int, submap: Submap) -> SE3:
-    """Return T_mission_odom by which the submap follows on what the map holds."""
-    rows = map_.vertices_of(mission_row)
-    first = submap.keyframes[0]
-    if not len(rows):
-        if submap.index != 0:
-            where = f"submap {submap.index} of mission {submap.mission_id}"
-            raise MapError(f"{where}: the map has no vertex of this mission; append submap 0 first")
-        return SE3.identity()
-    newest = int(rows[-1])
-    stamp_ns = int(map_.vertices.stamp_ns[newest])
-    if first.stamp_ns != stamp_ns:
-        raise MapError(
-            f"submap {submap.index} of mission {submap.mission_id} begins at {first.stamp_ns} ns,"
-            f" but the mission ends at {stamp_ns} ns; append submaps in order, each once"
-        )
-    return map_.vertices.T_mission_base_of(newest) @ first.odometry.T_odom_base.inverse()
-
-
-def _vertices(
-    keyframes: Sequence[Keyframe], mission: bytes, mission_row: int, T_mission_odom: SE3
-) -> Vertices:
-    odometry = [keyframe.odometry for keyframe in keyframes]
-    poses_odom = np.array([o.T_odom_base.matrix for o in odometry]).reshape(-1, 4, 4)
-    velocity_odom = _stacked([o.velocity_mps for o in odometry])
-    return Vertices(
-        id=id_array(vertex_id(mission, keyframe.stamp_ns) for keyframe in keyframes),
-        mission=np.full(len(keyframes), mission_row),
-        stamp_ns=np.array([keyframe.stamp_ns for keyframe in keyframes], dtype=np.int64),
-        T_mission_base=T_mission_odom.matrix @ poses_odom,
-        velocity_mps=velocity_odom @ T_mission_odom.R.T,
-        gyro_bias_radps=_stacked([o.gyro_bias_radps for o in odometry]),
-        accel_bias_mps2=_stacked([o.accel_bias_mps2 for o in odometry]),
-    )
-
-
-def _stacked(vectors: Iterable[FloatArray | None]) -> FloatArray:
-    rows = [np.full(3, np.nan) if vector is None else vector for vector in vectors]
-    return np.array(rows, dtype=np.float64).reshape(-1, 3)
 
 
 def add_edges(map_: Map, edges: Sequence[RelativePose]) -> Map:

@@ -60,7 +60,7 @@ class PointCloud:
 class RelativePose:
     """A measured transform between two vertices: odometry, registration or loop closure."""
 
-    kind: Literal["odometry", "wheel", "registration", "loop", "motion_model"]
+    kind: Literal["odometry", "wheel", "registration", "loop", "motion_model", "imu"]
     mission_a: str
     stamp_a_ns: int
     mission_b: str

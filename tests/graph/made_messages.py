@@ -8,7 +8,8 @@ import cv2
 import numpy as np
 
 from mapstream.recordings.maps import Map
-from mapstream.recordings.maps.build import add_edges, append_submap
+from mapstream.recordings.maps.build import add_edges
+from mapstream.recordings.maps.submaps import append_submap
 from mapstream.streams.geometry import SE3
 from mapstream.streams.messages.estimates import (
     ImageFeatures,

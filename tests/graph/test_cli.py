@@ -11,7 +11,7 @@ import pytest
 from mapstream.graph.cli import VERBS
 from mapstream.operators.samples import samples
 from mapstream.recordings.maps import Map, save_map
-from mapstream.recordings.maps.build import append_submap
+from mapstream.recordings.maps.submaps import append_submap
 from mapstream.streams.messages.estimates import Submap
 from tests.graph.terminal import Terminal
 

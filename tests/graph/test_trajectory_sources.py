@@ -10,7 +10,7 @@ import pytest
 from mapstream.graph.trajectory_sources import read_trajectory
 from mapstream.operators.samples import samples
 from mapstream.recordings.maps import Map, save_map
-from mapstream.recordings.maps.build import append_submap
+from mapstream.recordings.maps.submaps import append_submap
 from mapstream.recordings.mcap_writer import McapWriter
 from mapstream.recordings.trajectory_files import write_euroc, write_kitti, write_tum
 from mapstream.streams.errors import MapError, RecordingError

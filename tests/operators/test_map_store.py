@@ -12,8 +12,8 @@ from mapstream.operators.sinks.map_store import MapStore, MapStoreConfig
 from mapstream.operators.testing import run_operator
 from mapstream.recordings.cloud_store import read_cloud
 from mapstream.recordings.maps import Map, check_map, load_map
-from mapstream.recordings.maps.build import append_submap
 from mapstream.recordings.maps.folder import LOCK, FolderLock
+from mapstream.recordings.maps.submaps import append_submap
 from mapstream.streams.errors import MapError
 from mapstream.streams.messages.estimates import Submap
 from tests.recordings.made_maps import (

@@ -12,9 +12,9 @@ from hypothesis import strategies as st
 from mapstream.operators.submaps.keyframes import Keyframes, KeyframesConfig
 from mapstream.operators.submaps.submap_builder import SubmapBuilder, SubmapBuilderConfig
 from mapstream.operators.testing import run_operator
-from mapstream.recordings.maps.build import append_submap
 from mapstream.recordings.maps.check import check_map
 from mapstream.recordings.maps.model import Map
+from mapstream.recordings.maps.submaps import append_submap
 from mapstream.streams.geometry import SE3, se3_exp
 from mapstream.streams.messages.estimates import Keyframe, Odometry, PointCloud
 

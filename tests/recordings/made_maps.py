@@ -8,9 +8,10 @@ from pathlib import Path
 
 import numpy as np
 
-from mapstream.recordings.maps.build import append_edges, append_submap
+from mapstream.recordings.maps.build import append_edges
 from mapstream.recordings.maps.ids import derived_id, id_array
 from mapstream.recordings.maps.model import Map
+from mapstream.recordings.maps.submaps import append_submap
 from mapstream.recordings.maps.tables import Edges, Frames, ImuSamples, Landmarks, Observations
 from mapstream.streams.geometry import SE3
 from mapstream.streams.messages.estimates import (

@@ -9,9 +9,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mapstream.recordings.maps.build import add_edges, append_submap, with_poses
+from mapstream.recordings.maps.build import add_edges, with_poses
 from mapstream.recordings.maps.combine import merge_maps, select_missions, with_journal_entry
 from mapstream.recordings.maps.model import Map
+from mapstream.recordings.maps.submaps import append_submap
 from mapstream.streams.errors import MapError
 from mapstream.streams.geometry import SE3
 from mapstream.streams.messages.estimates import Submap

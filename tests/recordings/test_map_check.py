@@ -14,9 +14,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mapstream.recordings.maps import Map, check_map, require_valid
-from mapstream.recordings.maps.build import add_resources, append_submap, with_poses
+from mapstream.recordings.maps.build import add_resources, with_poses
 from mapstream.recordings.maps.combine import merge_maps, select_missions, with_journal_entry
 from mapstream.recordings.maps.structure_rules import STRUCTURE_RULES
+from mapstream.recordings.maps.submaps import append_submap
 from mapstream.recordings.maps.value_rules import VALUE_RULES
 from mapstream.streams.errors import MapCheckError
 from mapstream.streams.geometry import se3_exp

@@ -7,9 +7,10 @@ import pytest
 
 from mapstream.operators.estimation.batch import OptimizeConfig, optimize_map
 from mapstream.recordings.g2o import read_g2o
-from mapstream.recordings.maps.build import add_edges, append_submap
+from mapstream.recordings.maps.build import add_edges
 from mapstream.recordings.maps.check import check_map
 from mapstream.recordings.maps.model import Map
+from mapstream.recordings.maps.submaps import append_submap
 from mapstream.streams.geometry import SE3
 from tests.data import shared
 from tests.operators.estimation import worlds

@@ -12,8 +12,9 @@ from mapstream.operators.operator import Context
 from mapstream.operators.sinks.cloud import CloudSink, CloudSinkConfig
 from mapstream.operators.testing import run_operator
 from mapstream.recordings.cloud_files import read_pcd, read_ply
-from mapstream.recordings.maps.build import append_submap, with_poses
+from mapstream.recordings.maps.build import with_poses
 from mapstream.recordings.maps.model import Map
+from mapstream.recordings.maps.submaps import append_submap
 from mapstream.recordings.worlds.box_room import box_room, drive_through
 from mapstream.streams.geometry import SE3
 from mapstream.streams.messages.estimates import (
