@@ -5,6 +5,7 @@ from mapstream.streams.channel import Channel, Limits, Receiver, Sender
 from mapstream.streams.clock import Clock, ReplayClock, TestClock, WallClock
 from mapstream.streams.errors import MappingError
 from mapstream.streams.geometry import SE3
+from mapstream.streams.messages.constraints import Constraint, LandmarkRef, OuterFrame
 from mapstream.streams.messages.estimates import (
     ImageFeatures,
     Keyframe,
@@ -14,6 +15,7 @@ from mapstream.streams.messages.estimates import (
     Odometry,
     PointCloud,
     RelativePose,
+    Splice,
     Submap,
 )
 from mapstream.streams.messages.sensors import (
@@ -47,11 +49,13 @@ __all__ = [
     "CameraFrame",
     "Channel",
     "Clock",
+    "Constraint",
     "EncodedImage",
     "GnssFix",
     "ImageFeatures",
     "ImuBatch",
     "Keyframe",
+    "LandmarkRef",
     "LaserScan2D",
     "LidarScan",
     "Limits",
@@ -61,12 +65,14 @@ __all__ = [
     "MappingError",
     "Message",
     "Odometry",
+    "OuterFrame",
     "PointCloud",
     "Receiver",
     "RecordRef",
     "RelativePose",
     "ReplayClock",
     "Sender",
+    "Splice",
     "Submap",
     "TestClock",
     "Trajectory",
