@@ -7,6 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from mapstream.recordings.datasets.conversion import Convert, Notices, Progress
+from mapstream.recordings.datasets.described_csv import convert_csv
+from mapstream.recordings.datasets.euroc import convert_euroc
 from mapstream.recordings.datasets.kitti import convert_kitti
 from mapstream.recordings.datasets.kitti_inertial import convert_kitti_inertial, gtsam_data
 from mapstream.recordings.datasets.lidar_bins import convert_lidar_bins
@@ -49,6 +51,8 @@ def convert_rosbag(source: Path, writer: McapWriter, on_progress: Progress) -> N
 
 
 CONVERTERS = {
+    "csv": Converter("CSV whose header names IMU, GNSS, odometry, positions", convert_csv),
+    "euroc": Converter("folder of a EuRoC sequence", convert_euroc),
     "kitti": Converter("folder of KITTI odometry scans", convert_kitti),
     "kitti00-gtsam": Converter(
         "470 s of IMU and GPS from the installed gtsam; needs no PATH",

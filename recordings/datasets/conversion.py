@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import heapq
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -10,12 +11,14 @@ import numpy as np
 
 from mapstream.recordings.mcap_writer import McapWriter
 from mapstream.streams.errors import RecordingError
-from mapstream.streams.messages.sensors import Float32Array
+from mapstream.streams.messages.sensors import Float32Array, FloatArray, ImuBatch, IntArray, Message
 
 Progress = Callable[[float], None]  # told the fraction done
+Topical = tuple[str, Message]  # a message and its topic
 Notices = tuple[str, ...]  # what a user should know of the result
 Convert = Callable[[Path, McapWriter, Progress], Notices]
 
+_BATCH = 10  # IMU samples in a message
 _FIELDS = 4  # x, y, z [m], intensity
 
 
@@ -64,3 +67,32 @@ def read_bin(path: Path) -> BinScan:
 def drop_notice(num_dropped: int) -> Notices:
     """Say how many points were left out."""
     return (f"{num_dropped} points that were not finite were left out",) if num_dropped else ()
+
+
+def imu_batches(
+    topic: str, stamps_ns: IntArray, gyro_radps: FloatArray, accel_mps2: FloatArray
+) -> Iterator[Topical]:
+    """Yield samples (N,), (N, 3), (N, 3) in messages of a few."""
+    for first in range(0, len(stamps_ns), _BATCH):
+        part = slice(first, first + _BATCH)
+        batch = ImuBatch(
+            stamps_ns=stamps_ns[part], gyro_radps=gyro_radps[part], accel_mps2=accel_mps2[part]
+        )
+        yield topic, batch
+
+
+def write_in_order(
+    writer: McapWriter,
+    streams: Iterable[Iterable[Topical]],
+    span_ns: tuple[int, int],
+    on_progress: Progress,
+) -> None:
+    """Write streams of messages, each in the order of its stamps, as one.
+
+    Raises:
+        RecordingError: If the disk is full.
+    """
+    start_ns, end_ns = span_ns
+    for topic, message in heapq.merge(*streams, key=lambda item: item[1].stamp_ns):
+        writer.write(topic, message)
+        on_progress((message.stamp_ns - start_ns) / max(end_ns - start_ns, 1))

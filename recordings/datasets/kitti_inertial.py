@@ -13,7 +13,6 @@ Source: Geiger et al., KITTI, IJRR 2013; variance of the positions from gtsam's 
 
 from __future__ import annotations
 
-import heapq
 from collections.abc import Iterator
 from dataclasses import dataclass
 from importlib.util import find_spec
@@ -22,7 +21,13 @@ from pathlib import Path
 import numpy as np
 
 from mapstream.recordings.attached_rig import attach_rig
-from mapstream.recordings.datasets.conversion import Notices, Progress
+from mapstream.recordings.datasets.conversion import (
+    Notices,
+    Progress,
+    Topical,
+    imu_batches,
+    write_in_order,
+)
 from mapstream.recordings.datasets.number_tables import read_table
 from mapstream.recordings.maps.ids import derived_id
 from mapstream.recordings.mcap_writer import McapWriter
@@ -30,7 +35,7 @@ from mapstream.streams.errors import RecordingError
 from mapstream.streams.geometry import SE3, quat_xyzw_from_rotation
 from mapstream.streams.messages.constraints import Constraint, OuterFrame
 from mapstream.streams.messages.estimates import Odometry
-from mapstream.streams.messages.sensors import FloatArray, ImuBatch, Message
+from mapstream.streams.messages.sensors import FloatArray
 from mapstream.streams.rig import Extrinsics, Rig
 from mapstream.streams.sensors import ImuNoise, ImuSensor
 
@@ -40,11 +45,9 @@ NOISE_FILE = "KittiEquivBiasedImu_metadata.txt"
 FIXES_FILE = "KittiGps_converted.txt"
 CAMERA_FILE = "VO_camera_poses00.txt"
 _POSITION_VARIANCE_M2 = 0.07
-_BATCH = 10  # samples in a message
 _MAX_GAP_S = 0.1  # of the IMU
 _FRAME_PERIOD_S = 0.1036
 _FIRST_FRAME_S = 0.54  # after the first line of the IMU
-_Topical = tuple[str, Message]
 _R_BASE_CAMERA = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 
 
@@ -77,15 +80,13 @@ def convert_kitti_inertial(source: Path, writer: McapWriter, on_progress: Progre
     fixes = read_table(source / FIXES_FILE, 4, separator=",", header=1)
     start_s, end_s = imu.rows[0, 0], imu.rows[-1, 0]
     is_within = (fixes[:, 0] >= start_s) & (fixes[:, 0] <= end_s)
-    messages = heapq.merge(
-        _batches(imu.rows),
+    stamps_ns = np.round(imu.rows[:, 0] * 1e9).astype(np.int64)
+    streams = (
+        imu_batches(IMU, stamps_ns, imu.rows[:, 5:8], imu.rows[:, 2:5]),
         _positions(fixes[is_within]),
         _camera_poses(source / CAMERA_FILE, imu),
-        key=lambda item: item[1].stamp_ns,
     )
-    for topic, message in messages:
-        writer.write(topic, message)
-        on_progress((message.stamp_ns * 1e-9 - start_s) / (end_s - start_s))
+    write_in_order(writer, streams, (int(stamps_ns[0]), int(stamps_ns[-1])), on_progress)
     notices = []
     num_fixes = int((~is_within).sum())
     if imu.num_left_out or num_fixes:
@@ -128,20 +129,7 @@ def _read_rig(path: Path) -> Rig:
     return Rig([imu], [place])
 
 
-def _batches(rows: FloatArray) -> Iterator[_Topical]:
-    for first in range(0, len(rows), _BATCH):
-        batch = rows[first : first + _BATCH]
-        yield (
-            IMU,
-            ImuBatch(
-                stamps_ns=np.round(batch[:, 0] * 1e9).astype(np.int64),
-                accel_mps2=batch[:, 2:5],
-                gyro_radps=batch[:, 5:8],
-            ),
-        )
-
-
-def _positions(fixes: FloatArray) -> Iterator[_Topical]:
+def _positions(fixes: FloatArray) -> Iterator[Topical]:
     frame = OuterFrame(name="gps")
     covariance = np.diag([np.inf] * 3 + [_POSITION_VARIANCE_M2] * 3)
     for time_s, *position in fixes.tolist():
@@ -158,7 +146,7 @@ def _positions(fixes: FloatArray) -> Iterator[_Topical]:
         )
 
 
-def _camera_poses(path: Path, imu: _Imu) -> Iterator[_Topical]:
+def _camera_poses(path: Path, imu: _Imu) -> Iterator[Topical]:
     """Yield the camera's poses, turned to the robot's axes, from where the IMU runs on."""
     rows = read_table(path, 17)
     times_s = imu.first_line_s + _FIRST_FRAME_S + rows[:, 0] * _FRAME_PERIOD_S

@@ -125,7 +125,7 @@ def test_tum_trajectory_as_odometry(tmp_path: Path) -> None:
     [
         (
             "velodyne:x",
-            r"'velodyne:x' is no source to convert; expected one of kitti:PATH, .*tum:PATH",
+            r"'velodyne:x' is no source to convert; expected one of csv:PATH, .*tum:PATH",
         ),
         ("x", "'x' is no source"),
         ("kitti:/nowhere/at/all", "there is nothing at /nowhere/at/all"),
