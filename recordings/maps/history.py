@@ -35,7 +35,7 @@ def change_map(
         path: The map's folder.
         operation: The name of what is done.
         tool: Takes the map, returns the changed one and a report.
-        parameters: With what it is done; JSON values.
+        parameters: With what it is done; JSON values, those that are None are left out.
 
     Raises:
         MapFormatError: If there is no map, or it is damaged.
@@ -46,7 +46,8 @@ def change_map(
     read_manifest(folder)  # or the lock would make a folder where there is none
     with FolderLock(folder) as lock:
         changed, report = tool(require_valid(load_map(folder)))
-        changed = with_journal_entry(changed, operation, **parameters)
+        given = {name: value for name, value in parameters.items() if value is not None}
+        changed = with_journal_entry(changed, operation, **given)
         save_locked(require_valid(changed), lock, is_undoable=True)
         _remove_loose_clouds(folder)
     return report

@@ -130,7 +130,7 @@ def imu_samples_are_in_order(map_: Map) -> Iterable[Finding]:
 
 def missions_are_connected(map_: Map) -> Iterable[Finding]:
     """Edges within a mission join all of its vertices."""
-    component = _components(map_)
+    component = components(map_)
     for mission in range(len(map_.missions)):
         rows = map_.vertices_of(mission)
         parts = np.unique(component[rows])
@@ -140,7 +140,8 @@ def missions_are_connected(map_: Map) -> Iterable[Finding]:
             yield Finding("missions", np.array([mission]), sentence)
 
 
-def _components(map_: Map) -> IntArray:
+def components(map_: Map) -> IntArray:
+    """Return the number of the connected part of its mission for each vertex (V,)."""
     from scipy.sparse import coo_array  # noqa: PLC0415  # slow to import
     from scipy.sparse.csgraph import connected_components  # noqa: PLC0415
 

@@ -7,10 +7,13 @@ from typing import Annotated
 
 import typer
 
+from mapstream.graph.cli.map.edit import anchor, edit
 from mapstream.graph.cli.map.files import export_, import_
 from mapstream.graph.cli.map.history import journal, redo, undo
 from mapstream.graph.cli.map.look import check, stats, view
-from mapstream.graph.cli.map.solve import optimize
+from mapstream.graph.cli.map.loops import close_loops, fix_stationary, loops
+from mapstream.graph.cli.map.parts import merge, remove
+from mapstream.graph.cli.map.solve import optimize, relax
 
 app = typer.Typer(
     help="Work on a map: `mapstream map DIR COMMAND`.", no_args_is_help=True, rich_markup_mode=None
@@ -32,3 +35,11 @@ app.command("redo")(redo)
 app.command("import")(import_)
 app.command("export")(export_)
 app.command("optimize")(optimize)
+app.command("relax")(relax)
+app.command("close-loops")(close_loops)
+app.add_typer(loops, name="loops")
+app.command("fix-stationary")(fix_stationary)
+app.command("anchor")(anchor)
+app.add_typer(edit, name="edit")
+app.command("remove")(remove)
+app.command("merge")(merge)

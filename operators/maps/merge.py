@@ -1,0 +1,156 @@
+"""Maps that were made apart, as one: what several of them hold, by its id, is there once.
+
+Source: Cramariuc et al., maplab 2.0, RA-L 2023, section III-D (merging of missions and submaps).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from mapstream.operators.operator import OperatorConfig
+from mapstream.recordings.maps.combine import select_missions
+from mapstream.recordings.maps.ids import as_keys
+from mapstream.recordings.maps.model import TABLES, Map, from_tables
+from mapstream.recordings.maps.rows import concatenate, shifted, table_digest
+from mapstream.recordings.maps.tables import BoolArray, Frames, IdArray, Journal, references_of
+from mapstream.streams.errors import MapError
+from mapstream.streams.geometry import invert
+from mapstream.streams.messages.sensors import IntArray
+
+_WITH_IDS = ("missions", "frames", "vertices", "landmarks", "edges", "resources")
+_PARTS = (("imu", "edge"), ("observations", "vertex"))  # go with what they are a part of
+
+
+class MergeConfig(OperatorConfig):
+    """How maps come together."""
+
+    has_common_frame: bool = False
+    """The maps share a map frame. Else only a mission that two maps hold tells how they lie."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MergeReport:
+    """What came together."""
+
+    num_missions: int
+    num_vertices: int
+    repeated: tuple[str, ...]  # ids of missions that several maps held
+
+
+def merge(maps: Sequence[Map], config: MergeConfig | None = None) -> tuple[Map, MergeReport]:
+    """Return one map with the missions of all; the first map's frame is the map frame.
+
+    A mission that is in several maps with the same content is there once, and places the others of its map.
+    Missions of maps without a known place keep it as a guess, until something anchors them.
+
+    Raises:
+        MapError: If two maps hold one mission with different content, or one outer frame with two origins.
+    """
+    config = config or MergeConfig()
+    merged, repeated = Map.empty(), list[str]()
+    for number, map_ in enumerate(maps):
+        common = _common_missions(merged, map_)
+        _require_same_frames(merged.frames, map_.frames)
+        added = map_ if number == 0 or config.has_common_frame else _placed(map_, merged, common)
+        num_rows = {name: len(table) for name, table in merged.tables().items()}
+        pairs = zip(TABLES, merged.tables().values(), added.tables().values(), strict=True)
+        both = {name: concatenate([old, shifted(new, num_rows)]) for name, old, new in pairs}
+        merged = _with_each_row_once(from_tables(both))
+        repeated += common
+    return merged, MergeReport(
+        num_missions=len(merged.missions),
+        num_vertices=len(merged.vertices),
+        repeated=tuple(repeated),
+    )
+
+
+def _common_missions(a: Map, b: Map) -> list[str]:
+    """Return the ids of missions of both maps.
+
+    Raises:
+        MapError: If one differs.
+    """
+    keys = np.intersect1d(as_keys(a.missions.id), as_keys(b.missions.id))
+    common = [key.tobytes().hex() for key in keys]
+    for mission_id in common:
+        contents = zip(
+            _content(a, mission_id).items(), _content(b, mission_id).values(), strict=True
+        )
+        differing = [name for (name, left), right in contents if left != right]
+        if differing:
+            raise MapError(
+                f"mission {mission_id} is in two maps, and its {', '.join(differing)} differ;"
+                " remove it from one of them before merging"
+            )
+    return common
+
+
+def _content(map_: Map, mission_id: str) -> dict[str, bytes]:
+    """Return a hash by table of what a mission holds, wherever it lies and whatever it is called."""
+    alone = select_missions(map_, [mission_id])
+    missions = replace(
+        alone.missions,
+        name=np.array([""], dtype=object),
+        T_map_mission=np.eye(4)[None],
+        is_base_frame_known=np.array([False]),
+    )
+    alone = replace(alone, missions=missions, frames=Frames(), journal=Journal())
+    return {name: table_digest(table) for name, table in alone.tables().items()}
+
+
+def _require_same_frames(a: Frames, b: Frames) -> None:
+    """Refuse outer frames of one name with other origins: their measurements would not agree.
+
+    Raises:
+        MapError: If there are such frames.
+    """
+    _, rows_a, rows_b = np.intersect1d(as_keys(a.id), as_keys(b.id), return_indices=True)
+    for i, j in zip(rows_a, rows_b, strict=True):
+        same_origin = np.array_equal(a.origin_lla[i], b.origin_lla[j], equal_nan=True)
+        if a.crs[i] != b.crs[j] or not same_origin:
+            raise MapError(
+                f"outer frame {a.name[i]!r} has origin {a.origin_lla[i].tolist()} {a.crs[i]!r} in one map"
+                f" and {b.origin_lla[j].tolist()} {b.crs[j]!r} in another; map them with one origin"
+            )
+
+
+def _placed(added: Map, merged: Map, common: Sequence[str]) -> Map:
+    """Return a map in the frame of another one, by a mission whose place both know; else as a guess."""
+    missions, frames = added.missions, added.frames
+    for mission_id in common:
+        here, there = added.mission_row(mission_id), merged.mission_row(mission_id)
+        if missions.is_base_frame_known[here] and merged.missions.is_base_frame_known[there]:
+            T_map_mission = merged.missions.T_map_mission[there]
+            T_merged_added = T_map_mission @ invert(missions.T_map_mission[here])
+            return replace(
+                added,
+                missions=replace(missions, T_map_mission=T_merged_added @ missions.T_map_mission),
+                frames=replace(frames, T_map_frame=T_merged_added @ frames.T_map_frame),
+            )
+    return replace(
+        added,
+        missions=replace(missions, is_base_frame_known=np.zeros(len(missions), dtype=bool)),
+        frames=replace(frames, is_known=np.zeros(len(frames), dtype=bool)),
+    )
+
+
+def _with_each_row_once(map_: Map) -> Map:
+    """Return the map without rows whose id is that of an earlier one; what referred to them refers to that."""
+    stands_for, keep = dict[str, IntArray](), dict[str, BoolArray]()
+    for name in _WITH_IDS:
+        ids: IdArray = map_.tables()[name].id  # type: ignore[attr-defined]  # these have ids
+        _, first, number = np.unique(as_keys(ids), return_index=True, return_inverse=True)
+        stands_for[name] = np.append(first[number], -1)  # the last is that of no row
+        keep[name] = first[number] == np.arange(len(ids))
+    tables = map_.tables()
+    for name, table in tables.items():
+        redirected = {
+            column.name: stands_for[str(column.refers_to)][getattr(table, column.name)]
+            for column in references_of(type(table))
+            if (name, column.name) not in _PARTS
+        }
+        tables[name] = replace(table, **redirected) if redirected else table
+    return from_tables(tables).select(**keep)

@@ -1,0 +1,106 @@
+"""Maps that were made apart become one, and nothing is in it twice."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from mapstream.operators.maps.merge import MergeConfig, merge
+from mapstream.recordings.maps import Map, check_map
+from mapstream.recordings.maps.build import add_edges, anchored, with_poses
+from mapstream.recordings.maps.combine import select_missions
+from mapstream.streams.errors import MapError
+from mapstream.streams.geometry import SE3
+from mapstream.streams.messages.estimates import RelativePose
+from tests.recordings.made_maps import COVARIANCE, MISSION, OTHER_MISSION, full_map, line_map
+
+THIRD = "b1" * 16
+
+
+def joined_by_loop(a: Map, b: Map) -> Map:
+    """Both maps, with a loop between their first vertices."""
+    both, _ = merge([a, b])
+    mission_a, mission_b = both.mission_id(0), both.mission_id(1)
+    loop = RelativePose(
+        kind="loop",
+        mission_a=mission_a,
+        stamp_a_ns=int(a.vertices.stamp_ns[0]),
+        mission_b=mission_b,
+        stamp_b_ns=int(b.vertices.stamp_ns[0]),
+        T_a_b=SE3.identity(),
+        covariance=COVARIANCE,
+    )
+    return add_edges(both, [loop])
+
+
+def test_M4_any_number_of_maps_become_one_and_sensors_stay_apart() -> None:
+    maps = [full_map(), line_map(4, OTHER_MISSION), line_map(3, THIRD)]
+    sensors = np.array(['{"lidar": 1}'], dtype=object)
+    maps[1] = replace(maps[1], missions=replace(maps[1].missions, sensors=sensors))
+
+    together, report = merge(maps)
+
+    assert (report.num_missions, report.num_vertices, report.repeated) == (3, 13, ())
+    assert together.missions.sensors.tolist() == ["{}", '{"lidar": 1}', "{}"]
+    assert together.missions.is_base_frame_known.tolist() == [True, False, False]
+    assert check_map(together) == []
+    assert select_missions(together, [MISSION]).digest() == full_map().digest()
+
+
+def test_M5_a_mission_that_both_hold_is_there_once_with_the_edges_of_both() -> None:
+    common = full_map()
+    a = joined_by_loop(common, line_map(4, OTHER_MISSION))
+    b = joined_by_loop(common, line_map(3, THIRD))
+
+    together, report = merge([a, b])
+
+    assert report.repeated == (MISSION,)
+    assert (len(together.missions), len(together.vertices)) == (3, 13)
+    assert (together.edges.kind == "loop").sum() == 2
+    assert len(together.imu) == len(common.imu)
+    assert len(together.observations) == len(common.observations)
+    assert len(together.resources) == 13
+    assert check_map(together) == []
+    assert merge([a, a])[0].digest() == a.digest()
+
+
+def test_M4_a_common_mission_places_the_others() -> None:
+    T = SE3.exp([0.1, 0.2, 0.3, 4.0, 5.0, 6.0])
+    common, other = full_map(), line_map(4, OTHER_MISSION)
+    here = anchored(common, 0, T)
+    there = anchored(merge([common, other])[0], 1, SE3.exp([0, 0, 1.0, 1.0, 0, 0]))
+
+    together, _ = merge([here, there])
+
+    T_map_other = together.missions.T_map_mission_of(1)
+    expected = T @ SE3.exp([0, 0, 1.0, 1.0, 0, 0])
+    np.testing.assert_allclose(T_map_other.matrix, expected.matrix, atol=1e-12)
+    assert together.missions.is_base_frame_known.tolist() == [True, True]
+
+
+def test_M4_maps_that_share_a_frame_keep_their_places() -> None:
+    together, _ = merge(
+        [full_map(), line_map(4, OTHER_MISSION)], MergeConfig(has_common_frame=True)
+    )
+
+    assert together.missions.is_base_frame_known.tolist() == [True, True]
+
+
+def test_M4_one_id_with_two_contents_is_refused_by_name() -> None:
+    moved = with_poses(full_map(), np.array([2]), np.eye(4))
+
+    with pytest.raises(
+        MapError, match=rf"mission {MISSION} is in two maps, and its vertices differ"
+    ):
+        merge([full_map(), moved])
+
+
+def test_M4_one_outer_frame_with_two_origins_is_refused() -> None:
+    a = full_map()
+    origin = a.frames.origin_lla + 1.0
+    b = replace(line_map(4, OTHER_MISSION), frames=replace(a.frames, origin_lla=origin))
+
+    with pytest.raises(MapError, match=r"outer frame 'enu' has origin \[47\.3.*in another"):
+        merge([a, b])
