@@ -31,7 +31,7 @@ STAMPS = st.lists(st.integers(0, 2_000_000_000), min_size=3, max_size=3).map(sor
 
 @settings(max_examples=50, deadline=None)
 @given(STAMPS)
-def test_G3_motions_over_adjoining_intervals_compose_exactly(stamps_ns: list[int]) -> None:
+def test_C1_motions_over_adjoining_intervals_compose_exactly(stamps_ns: list[int]) -> None:
     a, b, c = stamps_ns
 
     first, second, whole = (WANDER.between(*p) for p in ((a, b), (b, c), (a, c)))
@@ -80,7 +80,7 @@ def test_just_past_the_newest_message_it_predicts_and_says_so() -> None:
 
 
 @pytest.mark.parametrize(("start_ns", "end_ns"), [(-1, 10), (0, 2_500_000_001), (10, 5)])
-def test_outside_it_refuses_with_what_it_has(start_ns: int, end_ns: int) -> None:
+def test_C1_outside_it_is_unavailable_and_says_what_there_is(start_ns: int, end_ns: int) -> None:
     with pytest.raises(EstimationError, match="unavailable; there is 0 to 2000000000 ns"):
         WANDER.between(start_ns, end_ns)
 
@@ -109,3 +109,90 @@ def test_an_unmeasured_step_is_not_called_measured() -> None:
     assert made.between(0, 10**8).is_measured
     assert not made.between(0, 2 * 10**8).is_measured
     assert made.between(2 * 10**8, 3 * 10**8).is_measured
+
+
+SECOND = 1_000_000_000
+TWIST = np.array([0.1, -0.2, 0.3, 1.0, 0.5, -0.2])  # per second
+
+
+def _buffer(seconds: int, rate_hz: int = 10) -> ContinuousSource:
+    buffer = ContinuousSource(np.eye(6))
+    for i in range(seconds * rate_hz + 1):
+        T_odom_base = SE3.exp(TWIST * i / rate_hz)
+        buffer.add(Odometry(stamp_ns=i * SECOND // rate_hz, T_odom_base=T_odom_base))
+    return buffer
+
+
+def test_B10_the_buffer_keeps_30_s() -> None:
+    buffer = _buffer(40)
+
+    assert len(buffer) == 301
+    buffer.pose_at(10 * SECOND)
+    with pytest.raises(EstimationError, match="there is 10000000000 to 40000000000 ns"):
+        buffer.pose_at(10 * SECOND - 1)
+
+
+def test_B10_up_to_500_ms_beyond_the_newest_are_predicted() -> None:
+    buffer = _buffer(5)
+
+    for ahead_ns in (1, SECOND // 4, SECOND // 2):
+        pose = buffer.pose_at(5 * SECOND + ahead_ns)
+        assert not buffer.between(5 * SECOND, 5 * SECOND + ahead_ns).is_measured
+        truth = SE3.exp(TWIST * (5 + ahead_ns / SECOND))
+        np.testing.assert_allclose(pose.matrix, truth.matrix, atol=1e-9)
+
+
+def test_B10_later_is_refused() -> None:
+    with pytest.raises(EstimationError, match="500 ms beyond"):
+        _buffer(5).pose_at(5 * SECOND + SECOND // 2 + 1_000_000)
+    with pytest.raises(EstimationError, match="no two messages yet"):
+        _buffer(0).pose_at(1)
+
+
+def test_B10_between_measurements_the_buffer_interpolates() -> None:
+    pose = _buffer(5).pose_at(SECOND + SECOND // 20)
+
+    np.testing.assert_allclose(pose.matrix, SE3.exp(TWIST * 1.05).matrix, atol=1e-12)
+
+
+def test_B10_time_that_runs_backwards_is_refused_until_cleared() -> None:
+    buffer = _buffer(1)
+    again = Odometry(stamp_ns=0, T_odom_base=SE3.identity())
+    with pytest.raises(EstimationError, match="odometry at 0 ns is not newer than at 1000000000"):
+        buffer.add(again)
+
+    buffer.clear()
+    buffer.add(again)
+
+    assert len(buffer) == 1
+
+
+def test_a_gap_is_not_interpolated() -> None:
+    made = ContinuousSource(np.eye(6), max_gap_ns=10**8)
+    for stamp_ns in (0, 10**8, 3 * 10**8, 4 * 10**8):
+        made.add(Odometry(stamp_ns=stamp_ns, T_odom_base=SE3.identity()))
+
+    assert made.measures(0, 10**8)
+    assert made.measures(3 * 10**8, 4 * 10**8)
+    assert not made.measures(0, 2 * 10**8)
+    with pytest.raises(EstimationError, match="less gaps over 100 ms"):
+        made.between(5 * 10**7, 35 * 10**7)
+
+
+def test_A10_the_state_at_a_stamp_has_velocity_and_biases_of_the_nearest_message() -> None:
+    made = ContinuousSource(np.eye(6))
+    for k in range(3):
+        made.add(
+            Odometry(
+                stamp_ns=k * 10**8,
+                T_odom_base=SE3.exp([0, 0, 0, 0.1 * k, 0, 0]),
+                velocity_mps=np.array([1.0, 0, 0]),
+                gyro_bias_radps=np.full(3, 0.01 * k),
+            )
+        )
+
+    state = made.state_at(16 * 10**7)
+
+    np.testing.assert_allclose(state.T_odom_base.t, [0.16, 0, 0])
+    assert state.gyro_bias_radps is not None
+    np.testing.assert_allclose(state.gyro_bias_radps, 0.02)

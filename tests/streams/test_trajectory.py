@@ -1,4 +1,4 @@
-"""Poses over time: interpolation, order, refusals; and the buffer and triggers that live on them."""
+"""Poses over time: interpolation, order, refusals; and the triggers that live on them."""
 
 from bisect import bisect_left, bisect_right
 
@@ -7,10 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mapstream.streams.errors import TransformError
 from mapstream.streams.geometry import SE3, se3_exp
-from mapstream.streams.messages.estimates import Odometry
-from mapstream.streams.pose_buffer import PoseBuffer
 from mapstream.streams.trajectory import Trajectory
 from mapstream.streams.triggers import Always, OnMotion, Periodic
 
@@ -86,62 +83,6 @@ def test_stamps_near_today_keep_their_nanoseconds() -> None:
     )
 
     np.testing.assert_allclose(trajectory.pose_at(start_ns + 3).t, 0.3 * trajectory.poses[1, :3, 3])
-
-
-def _buffer(seconds: int, rate_hz: int = 10) -> PoseBuffer:
-    buffer = PoseBuffer()
-    for i in range(seconds * rate_hz + 1):
-        T_odom_base = SE3.exp(TWIST * i / rate_hz)
-        buffer.add(Odometry(stamp_ns=i * SECOND // rate_hz, T_odom_base=T_odom_base))
-    return buffer
-
-
-def test_B10_the_buffer_keeps_30_s() -> None:
-    buffer = _buffer(40)
-
-    assert len(buffer) == 301
-    assert buffer.pose_at(10 * SECOND).is_predicted is False
-    with pytest.raises(TransformError, match="the buffer holds 10000000000 to 40000000000 ns"):
-        buffer.pose_at(10 * SECOND - 1)
-
-
-def test_B10_up_to_500_ms_beyond_the_newest_are_predicted() -> None:
-    buffer = _buffer(5)
-
-    for ahead_ns in (1, SECOND // 4, SECOND // 2):
-        pose = buffer.pose_at(5 * SECOND + ahead_ns)
-        assert pose.is_predicted
-        truth = SE3.exp(TWIST * (5 + ahead_ns / SECOND))
-        np.testing.assert_allclose(pose.T_odom_base.matrix, truth.matrix, atol=1e-9)
-
-
-def test_B10_later_is_refused() -> None:
-    with pytest.raises(TransformError, match="501 ms beyond the newest, and at most 500 ms"):
-        _buffer(5).pose_at(5 * SECOND + SECOND // 2 + 1_000_000)
-    with pytest.raises(TransformError, match="from two poses or more"):
-        _buffer(0).pose_at(1)
-    with pytest.raises(TransformError, match="the buffer holds nothing"):
-        PoseBuffer().pose_at(1)
-
-
-def test_B10_between_measurements_the_buffer_interpolates() -> None:
-    pose = _buffer(5).pose_at(SECOND + SECOND // 20)
-
-    expected = SE3.exp(TWIST).interpolate(SE3.exp(TWIST * 1.1), 0.5)
-    np.testing.assert_allclose(pose.T_odom_base.matrix, expected.matrix, atol=1e-12)
-    assert not pose.is_predicted
-
-
-def test_B10_time_that_runs_backwards_is_refused_until_cleared() -> None:
-    buffer = _buffer(1)
-    again = Odometry(stamp_ns=0, T_odom_base=SE3.identity())
-    with pytest.raises(ValueError, match="odometry at 0 after 1000000000 ns"):
-        buffer.add(again)
-
-    buffer.clear()
-    buffer.add(again)
-
-    assert len(buffer) == 1
 
 
 def test_B16_a_1_hz_trigger_fires_at_most_once_per_second() -> None:

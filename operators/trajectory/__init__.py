@@ -1,0 +1,1 @@
+"""From measurements of any sensor at any time to one connected trajectory."""
