@@ -19,6 +19,7 @@ from mapstream.recordings.g2o_text import (
     format_g2o,
     parse_g2o,
 )
+from mapstream.recordings.maps.edge_kinds import RELATIVE_KINDS
 from mapstream.recordings.maps.folder import write_whole
 from mapstream.recordings.maps.model import Map
 from mapstream.recordings.maps.tables import BoolArray, Edges
@@ -159,7 +160,8 @@ def write_g2o(map_: Map, path: Path | str) -> Counter[str]:
     rows = np.lexsort((vertices.stamp_ns, vertices.mission))
     number = np.empty(len(rows), dtype=np.int64)
     number[rows] = np.arange(len(rows))
-    is_fixed, is_written = edges.kind == "fixed", _is_written(edges)
+    is_fixed = (edges.kind == "fixed") & (edges.vertex_a >= 0)
+    is_written = _is_written(edges)
     chosen = np.flatnonzero(is_written)
     graph = G2oGraph(
         numbers=np.arange(len(rows)),
@@ -179,7 +181,8 @@ def write_g2o(map_: Map, path: Path | str) -> Counter[str]:
 
 def _is_written(edges: Edges) -> BoolArray:
     is_measured = np.isfinite(np.diagonal(edges.covariance, axis1=1, axis2=2)).any(axis=1)
-    is_relative = (edges.vertex_b >= 0) & (edges.kind != "imu")
+    is_relative = (edges.vertex_a >= 0) & (edges.vertex_b >= 0)
+    is_relative &= np.isin(edges.kind, RELATIVE_KINDS)
     written: BoolArray = is_relative & is_measured & (edges.switch >= 0.5)
     return written
 

@@ -1,4 +1,4 @@
-"""Maps to files of other tools; the suffix of the file chooses the format."""
+"""Maps to files of other tools; the suffix of the file chooses the format, a name without one is a folder."""
 
 from __future__ import annotations
 
@@ -6,13 +6,14 @@ from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import get_args, get_type_hints
 
 import numpy as np
 
 from mapstream.operators.maps.aggregate import AggregateConfig, aggregate_cloud
+from mapstream.operators.maps.csv_tables import write_tables
 from mapstream.recordings.cloud_files import write_pcd, write_ply
 from mapstream.recordings.g2o import write_g2o
+from mapstream.recordings.maps.edge_kinds import RELATIVE_KINDS
 from mapstream.recordings.maps.model import Map
 from mapstream.recordings.mcap_writer import McapWriter
 from mapstream.recordings.trajectory_files import write_euroc, write_kitti, write_tum
@@ -21,8 +22,6 @@ from mapstream.streams.geometry import SE3
 from mapstream.streams.messages.estimates import Odometry, RelativePose
 from mapstream.streams.messages.sensors import IntArray
 from mapstream.streams.trajectory import Trajectory
-
-_RELATIVE_KINDS = get_args(get_type_hints(RelativePose)["kind"])
 
 
 class ExportConfig(AggregateConfig):
@@ -34,17 +33,18 @@ class ExportReport:
     """What was written, and what the format has no place for."""
 
     files: tuple[Path, ...]
-    written: dict[str, int] = field(default_factory=dict)  # poses, edges, points
+    written: dict[str, int] = field(default_factory=dict)  # poses, edges, points, rows by table
     left_out: dict[str, int] = field(default_factory=dict)  # edges by kind
 
 
 def export_map(map_: Map, folder: Path, path: Path, config: ExportConfig) -> ExportReport:
-    """Write a map as `.tum`, `.kitti`, `.csv` (EuRoC), `.g2o`, `.ply`, `.pcd` or `.mcap`, in the map frame.
+    """Write a map as `.tum`, `.kitti`, `.csv` (EuRoC), `.g2o`, `.ply`, `.pcd` or `.mcap`, or as CSV tables, in the map frame.
 
     Args:
         map_: The map.
         folder: Where it lies, for its clouds.
         path: The file; of several missions, trajectories get a file each, with the mission in its name.
+            Without a suffix it is a folder, which gets a CSV file per table.
         config: See there.
 
     Raises:
@@ -53,7 +53,7 @@ def export_map(map_: Map, folder: Path, path: Path, config: ExportConfig) -> Exp
     """
     export = EXPORTERS.get(path.suffix.lower())
     if export is None:
-        raise MapError(f"{path}: unknown format {path.suffix!r}; known are {', '.join(EXPORTERS)}")
+        raise MapError(f"{path}: unknown format {path.suffix!r}; known are {KNOWN}")
     return export(map_, folder, path, config)
 
 
@@ -89,6 +89,12 @@ def _g2o(map_: Map, folder: Path, path: Path, config: ExportConfig) -> ExportRep
     return ExportReport(files=(path,), written=written, left_out=dict(left_out))
 
 
+def _csv_tables(map_: Map, folder: Path, path: Path, config: ExportConfig) -> ExportReport:  # noqa: ARG001
+    written = write_tables(map_, path)
+    rows = {file.stem: count for file, count in written.items()}
+    return ExportReport(files=tuple(written), written=rows)
+
+
 def _ply(map_: Map, folder: Path, path: Path, config: ExportConfig) -> ExportReport:
     cloud = aggregate_cloud(map_, folder, config)
     write_ply(path, cloud.points, cloud.intensity)
@@ -103,7 +109,7 @@ def _pcd(map_: Map, folder: Path, path: Path, config: ExportConfig) -> ExportRep
 
 def _mcap(map_: Map, folder: Path, path: Path, config: ExportConfig) -> ExportReport:  # noqa: ARG001
     """Write poses as Odometry on `/missions/ID/poses`, relative edges on `/edges`, by stamp."""
-    is_relative = np.isin(map_.edges.kind, _RELATIVE_KINDS) & (map_.edges.vertex_b >= 0)
+    is_relative = np.isin(map_.edges.kind, RELATIVE_KINDS) & (map_.edges.vertex_b >= 0)
     messages = [*_pose_messages(map_), *_edge_messages(map_, np.flatnonzero(is_relative))]
     messages.sort(key=lambda entry: entry[1].stamp_ns)  # stable: poses first
     with McapWriter(path) as writer:
@@ -155,4 +161,6 @@ EXPORTERS: dict[str, Callable[[Map, Path, Path, ExportConfig], ExportReport]] = 
     ".ply": _ply,
     ".pcd": _pcd,
     ".mcap": _mcap,
+    "": _csv_tables,
 }
+KNOWN = ", ".join(filter(None, EXPORTERS)) + ", or a folder for CSV tables"

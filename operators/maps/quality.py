@@ -9,7 +9,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mapstream.operators.maps.residuals import MOTION_KINDS, chi2, num_measured, relative_edges
+from mapstream.operators.maps.residuals import chi2, num_measured, relative_edges
+from mapstream.recordings.maps.edge_kinds import MOTION_KINDS
 from mapstream.recordings.maps.model import Map
 from mapstream.streams.errors import EstimationError
 

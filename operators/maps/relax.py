@@ -14,9 +14,9 @@ from mapstream.operators.estimation.batch import (
     optimize_map,
 )
 from mapstream.operators.maps.loops import LoopsReport, close_loops
-from mapstream.operators.maps.residuals import RELATIVE_KINDS
 from mapstream.recordings.maps.build import with_poses
 from mapstream.recordings.maps.combine import select_missions
+from mapstream.recordings.maps.edge_kinds import RELATIVE_KINDS
 from mapstream.recordings.maps.model import Map
 from mapstream.streams.messages.estimates import RelativePose
 

@@ -15,11 +15,11 @@ from pydantic import model_validator
 
 from mapstream.operators.maps.composing import Motion, composed
 from mapstream.operators.maps.landmark_homes import rehomed, without_vertices
-from mapstream.operators.maps.residuals import MOTION_KINDS
 from mapstream.operators.maps.split import split_mission
 from mapstream.operators.operator import OperatorConfig
 from mapstream.recordings.maps.build import append_edges
 from mapstream.recordings.maps.combine import select_missions
+from mapstream.recordings.maps.edge_kinds import MOTION_KINDS
 from mapstream.recordings.maps.model import Map
 from mapstream.recordings.maps.rows import concatenate, take
 from mapstream.recordings.maps.structure_rules import components

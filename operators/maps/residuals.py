@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from mapstream.recordings.maps.edge_kinds import RELATIVE_KINDS
 from mapstream.recordings.maps.model import Map
 from mapstream.streams.geometry import invert, se3_log
 from mapstream.streams.messages.sensors import FloatArray, IntArray
-
-RELATIVE_KINDS = ("odometry", "wheel", "registration", "motion_model", "loop")
-MOTION_KINDS = ("odometry", "wheel", "registration", "motion_model")  # a robot's, of its own motion
 
 
 def relative_edges(map_: Map, kinds: tuple[str, ...] = RELATIVE_KINDS) -> IntArray:

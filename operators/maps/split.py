@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from mapstream.operators.maps.residuals import MOTION_KINDS
+from mapstream.recordings.maps.edge_kinds import MOTION_KINDS
 from mapstream.recordings.maps.ids import derived_id, id_array
 from mapstream.recordings.maps.model import Map, vertex_ids
 from mapstream.recordings.maps.rows import concatenate, take

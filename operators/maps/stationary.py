@@ -10,9 +10,9 @@ from dataclasses import dataclass
 import numpy as np
 from pydantic import PositiveFloat, PositiveInt
 
-from mapstream.operators.maps.residuals import MOTION_KINDS
 from mapstream.operators.operator import OperatorConfig
 from mapstream.recordings.maps.build import append_edges
+from mapstream.recordings.maps.edge_kinds import MOTION_KINDS
 from mapstream.recordings.maps.model import Map
 from mapstream.recordings.maps.tables import Edges
 from mapstream.streams.geometry import invert, so3_log

@@ -8,18 +8,22 @@ from dataclasses import dataclass
 import numpy as np
 
 from mapstream.recordings.maps.model import Map
-from mapstream.streams.messages.sensors import IntArray
+from mapstream.streams.messages.sensors import FloatArray, IntArray
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class MissionStatistics:
     """One mission in numbers."""
 
     mission_id: str
     name: str
     is_anchored: bool
+    T_map_mission: FloatArray  # (4, 4) the base frame, as good as it is known
     num_vertices: int
+    start_ns: int  # 0 of a mission without vertices, as are the times below
     duration_s: float
+    step_s: float  # the median time between vertices
+    longest_gap_s: float
     length_m: float  # along the vertices
     num_observations: int
 
@@ -82,12 +86,17 @@ def _mission(map_: Map, row: int) -> MissionStatistics:
     rows = map_.vertices_of(row)
     positions = map_.vertices.T_mission_base[rows, :3, 3]
     stamps_ns = map_.vertices.stamp_ns[rows]
+    steps_s = np.diff(stamps_ns) / 1e9 if len(rows) > 1 else np.zeros(1)
     return MissionStatistics(
         mission_id=map_.mission_id(row),
         name=map_.missions.name[row],
         is_anchored=bool(map_.missions.is_base_frame_known[row]),
+        T_map_mission=map_.missions.T_map_mission[row],
         num_vertices=len(rows),
+        start_ns=int(stamps_ns[0]) if len(rows) else 0,
         duration_s=float(np.ptp(stamps_ns)) / 1e9 if len(rows) else 0.0,
+        step_s=float(np.median(steps_s)),
+        longest_gap_s=float(steps_s.max()),
         length_m=float(np.linalg.norm(np.diff(positions, axis=0), axis=1).sum()),
         num_observations=int((map_.vertices.mission[map_.observations.vertex] == row).sum()),
     )

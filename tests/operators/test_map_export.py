@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 from pathlib import Path
 
 import numpy as np
@@ -13,8 +14,9 @@ from mapstream.recordings.cloud_files import read_pcd, read_ply
 from mapstream.recordings.cloud_store import CloudStore
 from mapstream.recordings.decoding import decoder_for
 from mapstream.recordings.maps import Map, check_map
-from mapstream.recordings.maps.build import add_resources, anchored
+from mapstream.recordings.maps.build import add_resources, anchored, append_edges
 from mapstream.recordings.maps.combine import merge_maps
+from mapstream.recordings.maps.tables import Edges
 from mapstream.recordings.recording import open_recording
 from mapstream.streams.errors import MapError
 from mapstream.streams.geometry import SE3
@@ -127,9 +129,73 @@ def test_unknown_formats_are_refused(tmp_path: Path) -> None:
         import_map([tmp_path / "drive.bag"], ImportConfig())
 
 
-@pytest.mark.parametrize("suffix", [s for s in EXPORTERS if s not in (".g2o", ".mcap")])
+@pytest.mark.parametrize("suffix", [s for s in EXPORTERS if s not in (".g2o", ".mcap", "")])
 def test_an_empty_map_has_nothing_to_write(suffix: str, tmp_path: Path) -> None:
     with pytest.raises(MapError, match=r"no poses to write|there are no clouds"):
         export_map(Map.empty(), tmp_path, tmp_path / f"map{suffix}", CONFIG)
 
     assert not list(tmp_path.iterdir())
+
+
+def with_every_edge() -> Map:
+    """A map with edges on landmarks, between landmarks, with one end, and of a kind that nobody knows."""
+    more = Edges(
+        kind=np.array(["landmark", "parallel", "gravity", "fixed", "sonar"], dtype=object),
+        vertex_a=np.array([0, -1, 1, -1, 2]),
+        vertex_b=np.array([-1, -1, -1, -1, 4]),
+        landmark_a=np.array([0, 1, -1, 2, -1]),
+        landmark_b=np.array([-1, 2, -1, -1, -1]),
+        covariance=np.tile(np.eye(6), (5, 1, 1)),
+    )
+    return append_edges(placed_map(), more)
+
+
+@pytest.mark.parametrize("suffix", [".g2o", ".mcap"])
+def test_M12_edges_that_a_format_has_no_place_for_are_left_out_and_counted(
+    suffix: str, tmp_path: Path
+) -> None:
+    report = export_map(with_every_edge(), tmp_path, tmp_path / f"map{suffix}", CONFIG)
+
+    assert report.written == {"poses": 6, "edges": 5}
+    expected = {"imu": 5, "absolute": 1, "landmark": 1, "parallel": 1, "gravity": 1, "fixed": 1, "sonar": 1}  # fmt: skip
+    assert report.left_out == expected
+
+
+def read_csv(file: Path) -> list[dict[str, str]]:
+    with file.open() as lines:
+        return list(csv.DictReader(lines))
+
+
+def test_M12_tables_hold_every_number_exactly(tmp_path: Path) -> None:
+    map_ = with_every_edge()
+
+    report = export_map(map_, tmp_path, tmp_path / "tables", CONFIG)
+
+    assert report.written == {
+        "missions": 1, "vertices": 6, "edges": 16, "landmarks": 4, "observations": 5, "imu": 15,
+    }  # fmt: skip
+    assert set(report.files) == set((tmp_path / "tables").iterdir())
+    vertices = read_csv(tmp_path / "tables" / "vertices.csv")
+    poses = map_.T_map_base(np.arange(6))
+    found = [[float(row[f"{axis}_m"]) for axis in "xyz"] for row in vertices]
+    np.testing.assert_array_equal(found, poses[:, :3, 3])
+    speed = [np.linalg.norm([float(row[f"v{a}_mps"]) for a in "xyz"]) for row in vertices]
+    np.testing.assert_allclose(speed, 2.0)
+    assert vertices[0]["gyro_bias_x_radps"] == "nan"
+    imu = read_csv(tmp_path / "tables" / "imu.csv")
+    assert [float(row["accel_z_mps2"]) for row in imu] == [9.81] * 15
+    assert {row["mission"] for row in imu} == {MISSION}
+    landmarks = read_csv(tmp_path / "tables" / "landmarks.csv")
+    assert landmarks[3]["label"] == "chair"
+    assert [int(row["num_observations"]) for row in landmarks] == [2, 0, 1, 1]
+    edges = read_csv(tmp_path / "tables" / "edges.csv")
+    assert (edges[0]["sigma_x_m"], edges[10]["frame"]) == ("0.1", "enu")
+    [mission] = read_csv(tmp_path / "tables" / "missions.csv")
+    assert (mission["name"], mission["sensors"]) == ("line", "{}")
+
+
+def test_M12_an_empty_map_gives_headers(tmp_path: Path) -> None:
+    export_map(Map.empty(), tmp_path, tmp_path / "tables", CONFIG)
+
+    assert (tmp_path / "tables" / "vertices.csv").read_text().startswith('"vertex","mission"')
+    assert read_csv(tmp_path / "tables" / "imu.csv") == []

@@ -23,7 +23,7 @@ from tests.recordings.made_maps import OTHER_MISSION, full_map, line_map
 NUM_VERTICES = 8
 
 
-def test_statistics_of_a_map_made_by_hand() -> None:
+def test_M14_statistics_of_a_map_made_by_hand() -> None:
     map_ = merge_maps([full_map(), line_map(4, OTHER_MISSION)])
     switches = np.array([1.0, 0.2, *[1.0] * 12])
     map_ = replace(map_, edges=replace(map_.edges, switch=switches))
@@ -33,7 +33,10 @@ def test_statistics_of_a_map_made_by_hand() -> None:
     first, second = found.missions
     assert (first.num_vertices, first.is_anchored, first.num_observations) == (6, True, 5)
     assert (second.num_vertices, second.is_anchored, second.num_observations) == (4, False, 0)
-    assert first.duration_s == pytest.approx(2.5)
+    assert first.start_ns == 1_000
+    times_s = [first.duration_s, first.step_s, first.longest_gap_s]
+    np.testing.assert_allclose(times_s, [2.5, 0.5, 0.5])
+    np.testing.assert_array_equal(second.T_map_mission, map_.missions.T_map_mission[1])
     assert found.length_m == pytest.approx(8 * np.linalg.norm([1.0, 0.0, 0.02]), rel=1e-3)
     assert [(e.kind, e.count, e.num_switched_off) for e in found.edges] == [
         ("absolute", 1, 0),
@@ -45,7 +48,7 @@ def test_statistics_of_a_map_made_by_hand() -> None:
     assert found.num_rows["vertices"] == 10
 
 
-def test_coobservability_counts_landmarks_seen_from_both_missions() -> None:
+def test_M14_coobservability_counts_landmarks_seen_from_both_missions() -> None:
     map_ = merge_maps([full_map(), line_map(4, OTHER_MISSION)])
     observations = Observations(
         vertex=np.array([0, 1, 7, 8, 9, 2]),

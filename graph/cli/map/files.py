@@ -10,7 +10,7 @@ import typer
 from mapstream.graph.cli.map.look import print_statistics
 from mapstream.graph.cli.options import KeySetList, config_from
 from mapstream.graph.cli.output import JsonFlag, in_place, say, say_json
-from mapstream.operators.maps.export import EXPORTERS, ExportConfig, export_map
+from mapstream.operators.maps.export import KNOWN, ExportConfig, export_map
 from mapstream.operators.maps.import_ import IMPORTERS, ImportConfig, import_map
 from mapstream.recordings.maps import load_map, require_valid, save_map
 from mapstream.recordings.maps.combine import with_journal_entry
@@ -20,19 +20,19 @@ from mapstream.streams.errors import ConfigError
 
 def export_(
     context: typer.Context,
-    file: Annotated[Path, typer.Argument(help="The file: " + ", ".join(EXPORTERS) + ".")],
+    file: Annotated[Path, typer.Argument(help=f"The file: {KNOWN}.")],
     *,
     set_: KeySetList = None,
     json: JsonFlag = False,
 ) -> None:
-    """Write the map as a trajectory, a pose graph, a point cloud or a recording, by the file's suffix."""
+    """Write the map as a trajectory, pose graph, point cloud, recording or tables, by the file's suffix."""
     folder: Path = context.obj
     report = export_map(load_map(folder), folder, file, config_from(ExportConfig, set_))
     if json:
         say_json(report)
         return
     content = ", ".join(f"{count} {what}" for what, count in report.written.items())
-    for path in report.files:
+    for path in report.files if file.suffix else (file,):
         say(f"wrote {in_place(path)}: {content}")
     for kind, count in report.left_out.items():
         say(f"left out: {count} edges of kind {kind}, which {file.suffix} has no place for")

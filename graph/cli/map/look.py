@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated
 
+import numpy as np
 import typer
 
 from mapstream.graph.cli.output import (
@@ -19,6 +20,7 @@ from mapstream.graph.cli.output import (
 )
 from mapstream.operators.maps.statistics import map_statistics
 from mapstream.recordings.maps import check_map, load_map
+from mapstream.streams.messages.sensors import FloatArray
 
 
 def check(context: typer.Context, *, json: JsonFlag = False) -> None:
@@ -50,16 +52,24 @@ def print_statistics(folder: Path, *, json: bool) -> None:
     length = f"{found.length_m:.1f} m"
     say(f"{in_place(folder)}: {len(found.missions)} missions, {length}, digest {found.digest[:16]}")
     say_table(
-        ("mission", "name", "vertices", "duration s", "length m", "anchored"),
+        ("mission", "name", "vertices", "length m", "duration s", "step s", "longest gap s"),
         [
             (
                 m.mission_id,
                 m.name,
                 m.num_vertices,
-                m.duration_s,
                 m.length_m,
-                "yes" if m.is_anchored else "no",
+                m.duration_s,
+                m.step_s,
+                m.longest_gap_s,
             )
+            for m in found.missions
+        ],
+    )
+    say_table(
+        ("base frame", "known", "x m", "y m", "z m", "yaw deg"),
+        [
+            (m.mission_id[:8], "yes" if m.is_anchored else "no", *_place(m.T_map_mission))
             for m in found.missions
         ],
     )
@@ -70,6 +80,18 @@ def print_statistics(folder: Path, *, json: bool) -> None:
     for what, counts in (("landmarks", found.landmarks), ("files", found.resources)):
         if counts:
             say_table((what, "count"), list(counts.items()))
+    if found.coobservability.any():
+        names = [m.mission_id[:8] for m in found.missions]
+        counts_ = found.coobservability.tolist()
+        say_table(
+            ("landmarks seen by both", *names),
+            [(name, *row) for name, row in zip(names, counts_, strict=True)],
+        )
+
+
+def _place(T_map_mission: FloatArray) -> tuple[float, float, float, float]:
+    x, y, z = T_map_mission[:3, 3].tolist()
+    return x, y, z, float(np.rad2deg(np.arctan2(T_map_mission[1, 0], T_map_mission[0, 0])))
 
 
 def view(
