@@ -32,9 +32,13 @@ BUILT_IN = {
     "map_store": "mapstream.operators.sinks.map_store:MapStore",
     "mcap": "mapstream.operators.sources.mcap:McapSource",
     "mcap_sink": "mapstream.operators.sinks.mcap:McapSink",
+    "odometry_adapter": "mapstream.operators.odometry.odometry_adapter:OdometryAdapter",
+    "odometry_file": "mapstream.operators.sources.odometry_file:OdometryFile",
+    "odometry_guard": "mapstream.operators.odometry.odometry_guard:OdometryGuard",
     "optimizer": "mapstream.operators.backend.optimizer:Optimizer",
     "orb": "mapstream.operators.tracking.orb:Orb",
     "submap_builder": "mapstream.operators.submaps.submap_builder:SubmapBuilder",
+    "trajectory": "mapstream.operators.trajectory.trajectory:Trajectory",
     "trajectory_sink": "mapstream.operators.sinks.trajectory:TrajectorySink",
 }
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from mapstream.graph.cli.output import say_aside
-from mapstream.graph.fit import check_fit, propose_topics
+from mapstream.graph.fit import check_fit, propose_topics, readings_of
 from mapstream.graph.load import Graph, load_graph, preset_names
 from mapstream.graph.plan import Plan, plan
 from mapstream.recordings.recording import open_recording
@@ -56,8 +56,8 @@ def plan_request(request: Request) -> Planned:
     """
     graph = request.load()
     planned = plan(graph)
-    if request.recording is None:
-        return Planned(planned, [])
+    if request.recording is None or not readings_of(planned, request.recording):
+        return Planned(planned, [])  # or its source checks it, as that of text files does
     with open_recording(request.recording) as recording:
         if request.graph in preset_names() and not _has_chosen_topics(request):
             sets, remarks = propose_topics(planned, recording)

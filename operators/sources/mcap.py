@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
 import anyio.to_thread
 
@@ -18,6 +18,7 @@ from mapstream.operators.operator import (
 from mapstream.operators.sources.extrinsics import Extrinsics
 from mapstream.operators.sources.mcap_config import McapSourceConfig
 from mapstream.operators.sources.playback import Playback
+from mapstream.operators.sources.seeking import Seekable
 from mapstream.operators.sources.stamps import StampWatch
 from mapstream.operators.sources.topic_reader import Played, Reading, TopicReader
 from mapstream.recordings.attached_rig import attached_rig
@@ -28,16 +29,6 @@ from mapstream.streams.rig import Rig
 from mapstream.streams.rig_file import load_rig
 
 _ADVANCE_NS = 10_000_000  # of log time between two updates of all bounds
-
-
-@runtime_checkable
-class _Seekable(Protocol):
-    """A clock that can ask to play from somewhere else."""
-
-    @property
-    def section(self) -> tuple[int, int] | None: ...
-
-    def take_seek(self) -> int | None: ...
 
 
 class McapSource(DynamicPorts, Operator[NoPorts, Ports]):
@@ -129,7 +120,7 @@ class McapSource(DynamicPorts, Operator[NoPorts, Ports]):
     async def _play(self, playback: Playback, recording: Recording, outputs: Ports) -> None:
         """Send batch after batch, from where a seek says if there is one."""
         clock, activity = context().clock, context().activity
-        seekable = clock if isinstance(clock, _Seekable) else None
+        seekable = clock if isinstance(clock, Seekable) else None
         is_over = False
         while not is_over:
             batch = await offload(playback.next_batch)

@@ -36,6 +36,7 @@ _TYPES: dict[str, type[Any]] = {  # by the name of a port
     "transforms": TransformBatch,
     "calibrations": CameraCalibration,
     "constraints": Constraint,
+    "biases": ImuBatch,
 }
 
 

@@ -14,11 +14,9 @@ from mapstream.recordings.datasets.kitti_inertial import convert_kitti_inertial,
 from mapstream.recordings.datasets.lidar_bins import convert_lidar_bins
 from mapstream.recordings.mcap_whole import whole_mcap
 from mapstream.recordings.mcap_writer import McapWriter
+from mapstream.recordings.odometry_files import read_odometry
 from mapstream.recordings.recording import open_recording
-from mapstream.recordings.trajectory_files import read_tum
 from mapstream.streams.errors import ConfigError
-from mapstream.streams.geometry import SE3
-from mapstream.streams.messages.estimates import Odometry
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,13 +28,12 @@ class Converter:
     installed: Callable[[], Path] | None = None  # where the source is if no path is given
 
 
-def convert_tum(source: Path, writer: McapWriter, on_progress: Progress) -> Notices:
-    """Write the poses of a TUM file as `/odometry`."""
-    trajectory = read_tum(source)
-    rows = zip(trajectory.stamps_ns.tolist(), trajectory.poses, strict=True)
-    for index, (stamp_ns, T) in enumerate(rows):
-        writer.write("/odometry", Odometry(stamp_ns=stamp_ns, T_odom_base=SE3(T)))
-        on_progress((index + 1) / len(trajectory))
+def convert_odometry(source: Path, writer: McapWriter, on_progress: Progress) -> Notices:
+    """Write the poses of a text file as `/odometry`, with what else it says of them."""
+    poses = read_odometry(source)
+    for index, pose in enumerate(poses):
+        writer.write("/odometry", pose)
+        on_progress((index + 1) / len(poses))
     return ()
 
 
@@ -61,7 +58,7 @@ CONVERTERS = {
     ),
     "lidar_bins": Converter("folder of deskewed scans with alidarPose.csv", convert_lidar_bins),
     "rosbag": Converter("ROS 1 bag, rosbag2 or MCAP", convert_rosbag),
-    "tum": Converter("TUM trajectory", convert_tum),
+    "tum": Converter("TUM trajectory", convert_odometry),
 }
 
 

@@ -25,16 +25,13 @@ from mapstream.recordings.datasets.conversion import (
     write_in_order,
 )
 from mapstream.recordings.datasets.euroc_sensors import read_rig
-from mapstream.recordings.datasets.number_tables import read_stamped_table
 from mapstream.recordings.mcap_writer import McapWriter
-from mapstream.recordings.trajectory_files import read_euroc, read_tum
+from mapstream.recordings.number_tables import read_stamped_table
+from mapstream.recordings.odometry_files import read_odometry
 from mapstream.streams.errors import RecordingError
-from mapstream.streams.geometry import SE3
-from mapstream.streams.messages.estimates import Odometry
 from mapstream.streams.messages.sensors import EncodedImage
 
 _IMU_HEADER = "#timestamp [ns],w_RS_S_x"
-_FULL_TRUTH = 17  # columns: stamp, position, quaternion, velocity, biases
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,35 +91,8 @@ def _is_imu(path: Path) -> bool:
 
 
 def _truth(path: Path) -> Iterator[Topical]:
-    if ".tum" in path.name:
-        trajectory = read_tum(path)
-    elif _num_columns(path) < _FULL_TRUTH:
-        trajectory = read_euroc(path)
-    else:
-        yield from _states(path)
-        return
-    for stamp_ns, T in zip(trajectory.stamps_ns.tolist(), trajectory.poses, strict=True):
-        yield "/truth", Odometry(stamp_ns=stamp_ns, T_odom_base=SE3(T))
-
-
-def _num_columns(path: Path) -> int:
-    with path.open(encoding="utf-8", errors="replace") as lines:
-        return next((line.count(",") + 1 for line in lines if not line.startswith("#")), 0)
-
-
-def _states(path: Path) -> Iterator[Topical]:
-    stamps_ns, values = read_stamped_table(path, _FULL_TRUTH - 1, separator=",")
-    for stamp_ns, row in zip(stamps_ns.tolist(), values, strict=True):
-        yield (
-            "/truth",
-            Odometry(
-                stamp_ns=stamp_ns,
-                T_odom_base=SE3.from_quat_xyzw(np.roll(row[3:7], -1), row[:3]),
-                velocity_mps=row[7:10],
-                gyro_bias_radps=row[10:13],
-                accel_bias_mps2=row[13:16],
-            ),
-        )
+    for pose in read_odometry(path):
+        yield "/truth", pose
 
 
 def _images(folder: Path) -> Iterator[Topical]:

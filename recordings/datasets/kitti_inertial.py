@@ -28,9 +28,9 @@ from mapstream.recordings.datasets.conversion import (
     imu_batches,
     write_in_order,
 )
-from mapstream.recordings.datasets.number_tables import read_table
 from mapstream.recordings.maps.ids import derived_id
 from mapstream.recordings.mcap_writer import McapWriter
+from mapstream.recordings.number_tables import read_table
 from mapstream.streams.errors import RecordingError
 from mapstream.streams.geometry import SE3, quat_xyzw_from_rotation
 from mapstream.streams.messages.constraints import Constraint, OuterFrame

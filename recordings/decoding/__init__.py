@@ -47,6 +47,7 @@ _ROS: list[tuple[str, type[Any], _Read]] = [
     ("sensor_msgs/NavSatFix", GnssFix, ros.nav_sat_fix),
     ("nav_msgs/Odometry", Odometry, ros.odometry),
     ("nav_msgs/Odometry", WheelOdometry, ros.wheel_odometry),
+    ("maplab_msgs/OdometryWithImuBiases", Odometry, ros.odometry_with_biases),
     ("geometry_msgs/PoseStamped", Odometry, ros.pose),
     ("geometry_msgs/PoseWithCovarianceStamped", Odometry, ros.pose_with_covariance),
     ("tf2_msgs/TFMessage", TransformBatch, ros.transforms),

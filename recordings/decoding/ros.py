@@ -131,26 +131,47 @@ def nav_sat_fix(cursor: CdrCursor) -> GnssFix:
 
 
 def odometry(cursor: CdrCursor) -> Odometry:
-    """Read a nav_msgs/Odometry; its covariance is of the pose, not of a step, and is left out."""
-    stamp_ns, pose, _, twist = _ros_odometry(cursor)
-    return Odometry(stamp_ns=stamp_ns, T_odom_base=pose, velocity_mps=pose.R @ twist[:3])
+    """Read a nav_msgs/Odometry; its covariance is of the pose, not of a step, and is left out.
+
+    The twist is taken as the convention has it, in the frame of the body. One of zeros with a covariance of
+    zeros was never filled in (FAST-LIO2 does so), and is no velocity.
+    """
+    stamp_ns, pose, _, velocity_mps = _ros_odometry(cursor)
+    cursor.end()
+    return Odometry(stamp_ns=stamp_ns, T_odom_base=pose, velocity_mps=velocity_mps)
+
+
+def odometry_with_biases(cursor: CdrCursor) -> Odometry:
+    """Read a maplab_msgs/OdometryWithImuBiases: as nav_msgs/Odometry, the accelerometer's bias, the gyroscope's."""
+    stamp_ns, pose, _, velocity_mps = _ros_odometry(cursor)
+    accel_bias, gyro_bias = cursor.array("<f8", 3), cursor.array("<f8", 3)
+    cursor.end()  # the state of the odometry, one number, is not read
+    return Odometry(
+        stamp_ns=stamp_ns,
+        T_odom_base=pose,
+        velocity_mps=velocity_mps,
+        gyro_bias_radps=gyro_bias,
+        accel_bias_mps2=accel_bias,
+    )
 
 
 def wheel_odometry(cursor: CdrCursor) -> WheelOdometry:
     """Read a nav_msgs/Odometry as that of wheels."""
     stamp_ns, pose, covariance, _ = _ros_odometry(cursor)
+    cursor.end()
     return WheelOdometry(
         stamp_ns=stamp_ns, T_odom_base=pose, covariance=_rotation_first(covariance)
     )
 
 
-def _ros_odometry(cursor: CdrCursor) -> tuple[int, SE3, FloatArray, FloatArray]:
+def _ros_odometry(cursor: CdrCursor) -> tuple[int, SE3, FloatArray, FloatArray | None]:
+    """Return the stamp, the pose, its covariance, and the velocity in the frame of the pose."""
     stamp_ns, _ = cursor.header()
     cursor.text()  # child frame
     pose, covariance = SE3(cursor.pose()), cursor.array("<f8", 36)
-    twist, _ = cursor.array("<f8", 6), cursor.array("<f8", 36)
-    cursor.end()
-    return stamp_ns, pose, covariance, twist
+    twist, twist_covariance = cursor.array("<f8", 6), cursor.array("<f8", 36)
+    is_known = twist.any() or twist_covariance.any()
+    return stamp_ns, pose, covariance, pose.R @ twist[:3] if is_known else None
 
 
 def _rotation_first(covariance: FloatArray) -> FloatArray | None:
