@@ -32,6 +32,7 @@ __all__ = [
     "ape",
     "associate",
     "kitti_drift",
+    "pose_errors",
     "rpe",
 ]
 
@@ -105,8 +106,12 @@ def ape(pairs: PosePairs, mode: AlignmentMode = "se3") -> PoseErrors:
     Raises:
         EstimationError: As `align`.
     """
-    aligned = align(pairs, mode).apply(pairs.estimate)
-    errors = invert(pairs.reference) @ aligned
+    return pose_errors(pairs, align(pairs, mode))
+
+
+def pose_errors(pairs: PosePairs, alignment: Alignment) -> PoseErrors:
+    """Return the absolute pose errors after a given alignment."""
+    errors = invert(pairs.reference) @ alignment.apply(pairs.estimate)
     return _errors(pairs.stamps_ns, errors)
 
 

@@ -9,6 +9,7 @@ from typing import Annotated, Literal
 import numpy as np
 import typer
 
+from mapstream.graph.cli.evaluate_robots import Pairing, evaluate_robots, robots_of
 from mapstream.graph.cli.output import JsonFlag, say, say_json, say_table
 from mapstream.graph.trajectory_sources import read_trajectory
 from mapstream.recordings.evaluation import (
@@ -21,7 +22,7 @@ from mapstream.recordings.evaluation import (
     kitti_drift,
     rpe,
 )
-from mapstream.streams.errors import EstimationError
+from mapstream.streams.errors import ConfigError, EstimationError
 from mapstream.streams.trajectory import Trajectory
 
 
@@ -40,7 +41,14 @@ def evaluate(  # noqa: PLR0913  # one for each option of the command
     estimate: Annotated[
         Path, typer.Argument(help="A map, a recording, or a TUM, KITTI or EuRoC file.")
     ],
-    reference: Annotated[Path, typer.Argument(help="What it is judged by; the same kinds.")],
+    references: Annotated[
+        list[str],
+        typer.Argument(
+            metavar="REFERENCE...",
+            help="What it is judged by; the same kinds. Of a map with several missions: MISSION=PATH for"
+            " each, or one map with the same missions.",
+        ),
+    ],
     *,
     align: Annotated[AlignmentMode, typer.Option(help="se3, sim3, yaw or none.")] = "se3",
     max_difference_s: Annotated[
@@ -56,11 +64,20 @@ def evaluate(  # noqa: PLR0913  # one for each option of the command
     json: JsonFlag = False,
 ) -> None:
     """Compare a trajectory or map with a reference: absolute and relative errors, KITTI drift."""
-    pairs = associate(
-        read_trajectory(estimate, topic=topic, mission=mission),
-        read_trajectory(reference, topic=topic),
+    pairing = Pairing(
+        topic=topic,
         max_difference_ns=round(max_difference_s * 1e9),
         interpolate=interpolate,
+    )
+    robots = robots_of(estimate, references) if mission is None else None
+    if robots is not None:
+        evaluate_robots(robots, pairing, align, json=json)
+        return
+    if len(references) > 1:
+        raise ConfigError("eval: several references: say which mission each is of, MISSION=PATH")
+    pairs = pairing.pairs(
+        read_trajectory(estimate, topic=topic, mission=mission),
+        read_trajectory(Path(references[0]), topic=topic),
     )
     score = score_of(pairs, align, delta=delta, unit=unit)
     if json:

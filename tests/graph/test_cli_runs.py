@@ -9,12 +9,17 @@ import numpy as np
 import pytest
 
 from mapstream.operators.samples import samples
+from mapstream.recordings.maps import Map, save_map
+from mapstream.recordings.maps.build import anchored, with_poses
+from mapstream.recordings.maps.combine import merge_maps
 from mapstream.recordings.mcap_writer import McapWriter
 from mapstream.recordings.trajectory_files import read_tum, write_tum
+from mapstream.streams.geometry import SE3, se3_exp
 from mapstream.streams.messages.estimates import Odometry
 from mapstream.streams.messages.sensors import ImuBatch, LidarScan, Message
 from mapstream.streams.trajectory import Trajectory
 from tests.graph.terminal import Terminal
+from tests.recordings.made_maps import MISSION, OTHER_MISSION, line_map
 
 GRAPH = """\
 version: 1
@@ -303,6 +308,48 @@ class TestEval:
 
         assert done.code == 1
         assert "no stamps match" in done.err
+
+
+class TestEvalOfRobots:
+    @pytest.fixture
+    def folder(self, tmp_path: Path) -> Path:
+        """A map of two robots, of which the second lies 1 m off; their references are beside it."""
+        both = merge_maps([turning_map(MISSION), turning_map(OTHER_MISSION)])
+        for row, name in enumerate(("a.tum", "b.tum")):
+            vertices = both.vertices_of(row)
+            stamps_ns, poses = both.vertices.stamp_ns[vertices], both.T_map_base(vertices)
+            write_tum(tmp_path / name, Trajectory(stamps_ns=stamps_ns, poses=poses))
+        save_map(both, tmp_path / "truth")
+        moved = anchored(both, 1, SE3.from_rotation(np.eye(3), [1.0, 0, 0]))
+        save_map(moved, tmp_path / "m")
+        return tmp_path / "m"
+
+    def test_R3_one_alignment_for_all_and_one_for_each(
+        self, mapstream: Terminal, folder: Path
+    ) -> None:
+        references = (f"{MISSION[:4]}=a.tum", f"{OTHER_MISSION[:4]}=b.tum")
+
+        found = mapstream("eval", folder, *references, "--json").json
+
+        assert found["translation"]["rmse"] == pytest.approx(0.5, abs=0.1)
+        for robot in found["robots"].values():
+            assert robot["own_translation"]["rmse"] < 1e-6
+        by_map = mapstream("eval", folder, folder.parent / "truth", "--json").json
+        assert by_map["translation"]["rmse"] == pytest.approx(found["translation"]["rmse"])
+        assert "2 robots, 16 poses, one alignment se3" in mapstream("eval", folder, *references).out
+
+    def test_several_references_without_missions(self, mapstream: Terminal, folder: Path) -> None:
+        done = mapstream("eval", folder, "a.tum", "b.tum")
+
+        assert done.code == 2
+        assert "say which mission each is of, MISSION=PATH" in done.err
+
+
+def turning_map(mission: str) -> Map:
+    """A robot that does not go along a line."""
+    map_ = line_map(8, mission)
+    poses = se3_exp(np.random.default_rng(0).normal(size=(8, 6)))
+    return with_poses(map_, np.arange(8), poses)
 
 
 class TestMapFiles:
