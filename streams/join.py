@@ -64,6 +64,7 @@ class Port(Generic[M]):
         self.name = receiver.channel.name or f"port {index}"
         self.held: list[M] = []
         self.last_ns = BEGINNING  # the newest stamp taken
+        self.late: list[M] | None = None  # a list, if late messages are wanted all the same
         self._stats = stats
 
     @property
@@ -96,6 +97,8 @@ class Port(Generic[M]):
             return False
         if message.stamp_ns < self.receiver.arrival.bound_ns:
             self._stats.late[self.name] += 1
+            if self.late is not None:
+                self.late.append(message)
         else:
             insort(self.held, message, key=stamp_of)
             self.last_ns = max(self.last_ns, message.stamp_ns)
@@ -111,6 +114,8 @@ class Port(Generic[M]):
     def start_epoch(self) -> None:
         """Forget what is held: time starts anew."""
         self.held.clear()
+        if self.late is not None:
+            self.late.clear()
         self.last_ns = BEGINNING
 
     def forget_before(self, index: int) -> None:

@@ -45,8 +45,17 @@ def _next_port(ports: Sequence[Port[Any]]) -> Port[Any]:
 class Merge(Join[tuple[int, Any]]):
     """See `merge`."""
 
+    def __init__(self, receivers: Sequence[Receiver[Any]], *, keeps_late: bool = False) -> None:
+        super().__init__(receivers)
+        if keeps_late:
+            for port in self.ports:
+                port.late = []
+
     def _decide(self) -> tuple[int, Any] | Port[Any] | None:
         while True:
+            for port in self.ports:
+                if port.late:
+                    return port.index, port.late.pop(0)
             port = _next_port(self.ports)
             if port.next_ns == END:
                 return None
@@ -172,13 +181,14 @@ def merge(receiver1: Receiver[M1], /) -> Join[tuple[int, M1]]: ...
 @overload
 def merge(receiver1: Receiver[M1], receiver2: Receiver[M2], /) -> Join[tuple[int, M1 | M2]]: ...
 @overload
-def merge(*receivers: Receiver[Any]) -> Join[tuple[int, Any]]: ...
-def merge(*receivers: Receiver[Any]) -> Join[Any]:
+def merge(*receivers: Receiver[Any], keeps_late: bool = ...) -> Join[tuple[int, Any]]: ...
+def merge(*receivers: Receiver[Any], keeps_late: bool = False) -> Join[Any]:
     """Join: (port index, message) of all receivers in stamp order, equal stamps in port order.
 
     It ends when all have ended; one that ended no longer holds the others back.
+    A message behind its port's bound is dropped, or with `keeps_late` comes as soon as it is seen.
     """
-    return Merge(receivers)
+    return Merge(receivers, keeps_late=keeps_late)
 
 
 @overload

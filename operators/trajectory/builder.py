@@ -42,7 +42,6 @@ class TrajectoryBuilder:
         *,
         window_ns: int | None = 0,
         keep_ns: int = 30_000_000_000,
-        sensors: str = "{}",
     ) -> None:
         """Make a trajectory.
 
@@ -50,13 +49,12 @@ class TrajectoryBuilder:
             links: The sources of motion; whoever feeds them keeps them longer than `keep_ns`.
             window_ns: How late measurements are waited for; None: all is held until the end.
             keep_ns: How late a measurement may split a stretch that went out.
-            sensors: JSON: the sensor set with its calibration.
         """
+        self.sensors = "{}"  # JSON: the sensor set with its calibration
         self.lost: Counter[str] = Counter()  # measurements that found no place, by reason
         self._links = links
         self._window = CommitWindow(window_ns)
         self._keep_ns = keep_ns
-        self._sensors = sensors
         self._late: dict[int, list[Constraint]] = {}  # by stamp, not newer than the newest pose
         self._out: list[int] = []  # stamps of poses that went out, of the last while
         self._num_submaps = 0
@@ -125,7 +123,7 @@ class TrajectoryBuilder:
             EstimationError: If no source of motion reaches so far.
         """
         if not self._out:
-            return next(iter(self._links.sources.values())).state_at(stamp_ns)
+            raise EstimationError(f"nothing is known of {stamp_ns} ns: no pose went out yet")
         newest_ns = self._out[-1]
         for source in self._links.sources.values():
             if source.covers(newest_ns, stamp_ns):
@@ -197,7 +195,7 @@ class TrajectoryBuilder:
             constraints=tuple(constraints),
             imu=self._samples([*edges, *(e for splice in splices for e in splice.edges)]),
             splices=tuple(splices),
-            sensors=self._sensors,
+            sensors=self.sensors,
         )
         self._num_submaps += 1
         oldest_ns = self._out[-1] - self._keep_ns

@@ -1,0 +1,134 @@
+"""What a graph file says of a robot's trajectory: its sources of motion, and when poses are made."""
+
+from __future__ import annotations
+
+import json
+from typing import Annotated, Literal
+
+from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt, model_validator
+
+from mapstream.operators.operator import OperatorConfig
+from mapstream.operators.trajectory.sources import AXES, AxisSigmas
+from mapstream.streams.geometry import SE3
+
+Sigma = PositiveFloat | None
+
+
+class OdometryConfig(OperatorConfig):
+    """A source that gets `Odometry`."""
+
+    kind: Literal["odometry"]
+    sigma_rad: PositiveFloat = 0.002
+    """Uncertainty of a step where the message says nothing."""
+    sigma_m: PositiveFloat = 0.01
+    max_gap_s: PositiveFloat = 1.0
+    """Messages further apart are not interpolated."""
+
+
+class AxesConfig(OperatorConfig):
+    """Standard deviations by axis; `null` leaves an axis out."""
+
+    sigma_roll_rad: Sigma = None
+    sigma_pitch_rad: Sigma = None
+    sigma_yaw_rad: Sigma = None
+    sigma_x_m: Sigma = None
+    sigma_y_m: Sigma = None
+    sigma_z_m: Sigma = None
+
+    def sigmas(self) -> AxisSigmas:
+        """Return the deviations by axis."""
+        units = {"roll": "rad", "pitch": "rad", "yaw": "rad", "x": "m", "y": "m", "z": "m"}
+        return {axis: getattr(self, f"sigma_{axis}_{units[axis]}") for axis in AXES}
+
+
+class WheelConfig(AxesConfig):
+    """A source that gets `WheelOdometry`; sigmas are those after one metre of way, and grow with its root."""
+
+    kind: Literal["wheel"]
+    sigma_yaw_rad: Sigma = 0.02
+    sigma_x_m: Sigma = 0.05
+    sigma_y_m: Sigma = 0.05
+    turn_m_per_rad: PositiveFloat = 0.5
+    """The way that a turn on the spot counts for."""
+    max_gap_s: PositiveFloat = 1.0
+    """Messages further apart are not interpolated."""
+
+
+class StillConfig(AxesConfig):
+    """A prior that nothing moves, beside the other sources; sigmas are those after one second."""
+
+    kind: Literal["still"]
+
+
+class ImuConfig(OperatorConfig):
+    """Noise of the IMU; the defaults are those of a MEMS of the better kind."""
+
+    gyro_density: PositiveFloat = 1e-3
+    """White noise [rad/s/sqrt(Hz)]."""
+    accel_density: PositiveFloat = 1e-2
+    """White noise [m/s^2/sqrt(Hz)]."""
+    gyro_random_walk: PositiveFloat = 1e-5
+    """Of the bias [rad/s^2/sqrt(Hz)]."""
+    accel_random_walk: PositiveFloat = 1e-4
+    """Of the bias [m/s^3/sqrt(Hz)]."""
+    gravity_mps2: PositiveFloat = 9.81
+    max_gap_s: PositiveFloat = 0.2
+    """Samples further apart are not integrated."""
+
+    def described(self, T_base_sensor: SE3) -> dict[str, object]:
+        """Return what a mission's sensor set says of the IMU."""
+        place = [*T_base_sensor.t.tolist(), *T_base_sensor.quat_xyzw.tolist()]
+        return {**self.model_dump(exclude={"max_gap_s"}), "T_base_sensor": place}
+
+
+SourceConfig = Annotated[OdometryConfig | WheelConfig | StillConfig, Field(discriminator="kind")]
+
+
+class TrajectoryConfig(OperatorConfig):
+    """Options of `trajectory`: each source, each name under `constraints`, `imu` and `clouds` is an input."""
+
+    sources: dict[str, SourceConfig] = Field(default_factory=dict)
+    """Sources of motion by name; the first that knows an interval gives the first guess."""
+    imu: ImuConfig | None = None
+    """With an IMU: an input `imu`, and its noise."""
+    constraints: tuple[str, ...] = ()
+    """Names of inputs of measurements on poses."""
+    clouds: bool = False
+    """An input `clouds`: poses are made where clouds are, and keep them."""
+    bridge: Literal["none", "still", "constant_velocity"] = "still"
+    """What links poses between which nothing was measured; `none` makes that an error."""
+    period_s: PositiveFloat | None = 1.0
+    """A pose is made at least so often, also if no measurement asks for one."""
+    distance_m: PositiveFloat | None = None
+    """A pose is made after so much way."""
+    rotation_rad: PositiveFloat | None = None
+    """A pose is made after so much of a turn."""
+    window_s: NonNegativeFloat | None = 0.0
+    """How late measurements are waited for; `null`: all is held until the end."""
+    late_s: PositiveFloat = 30.0
+    """How late a measurement may split a stretch that went out."""
+    waits: bool = True
+    """Inputs of measurements hold the others back, so that nothing depends on when messages arrive."""
+    submap_s: PositiveFloat = 5.0
+    """A submap goes out when it is so long ..."""
+    num_poses: PositiveInt = 50
+    """... or has so many poses."""
+    mission: str = ""
+    """Tells missions apart that begin at the same time; one robot needs none."""
+
+    @model_validator(mode="after")
+    def _check_names(self) -> TrajectoryConfig:
+        names = [*self.sources, *self.constraints, "imu", "clouds"]
+        twice = sorted({name for name in names if names.count(name) > 1})
+        if twice:
+            raise ValueError(f"two inputs are called {twice[0]}; give each a name of its own")
+        return self
+
+    def described(self, T_base_imu: SE3) -> str:
+        """Return the sensor set as a map's mission keeps it."""
+        sensors: dict[str, object] = {
+            "sources": {name: source.model_dump() for name, source in self.sources.items()}
+        }
+        if self.imu is not None:
+            sensors["imu"] = self.imu.described(T_base_imu)
+        return json.dumps(sensors, sort_keys=True)
