@@ -13,7 +13,7 @@ from importlib.metadata import entry_points
 
 import numpy as np
 
-from mapstream.operators.estimation import absolute, relative
+from mapstream.operators.estimation import absolute, inertial, landmarks, relations, relative
 from mapstream.operators.estimation.noise import Factor, NoiseModels
 from mapstream.recordings.maps.model import Map
 from mapstream.streams.errors import EstimationError
@@ -30,6 +30,17 @@ _BUILT_IN: dict[str, Maker] = {
     "motion_model": relative.between,
     "loop": relative.between,
     "absolute": absolute.pose,
+    "position": absolute.position,
+    "gravity": absolute.gravity,
+    "fixed": absolute.fixed,
+    "range": landmarks.distance,
+    "landmark": landmarks.seen,
+    "plane": landmarks.seen,
+    "point_on_plane": relations.point_on_plane,
+    "parallel": relations.parallel,
+    "perpendicular": relations.perpendicular,
+    "coplanar": relations.coplanar,
+    "imu": inertial.imu,
 }
 _registered: dict[str, Maker] = {}
 

@@ -13,11 +13,15 @@ from mapstream.streams.messages.sensors import FloatArray
 Factor = Any  # gtsam has no types
 
 
-def noise_from_covariance(covariance: FloatArray) -> Any:  # noqa: ANN401  # gtsam has no types
-    """Return the noise model of a covariance (6, 6), rotation first [rad, m].
+def noise_from_covariance(covariance: FloatArray, jacobian: FloatArray | None = None) -> Any:  # noqa: ANN401
+    """Return the noise model of a covariance (N, N), of poses (6, 6) with rotation first [rad, m].
 
     A direction with an infinite variance was not measured: its information is exactly zero, never a huge
     sigma. `gtsam.noiseModel.Gaussian.Information` is silently wrong for singular matrices, hence the root.
+
+    Args:
+        covariance: Of the measurement's error.
+        jacobian: (N, M) of the measurement's error by the factor's error, where these differ.
 
     Raises:
         EstimationError: If a finite part is not positive definite, or a NaN is in it.
@@ -29,12 +33,14 @@ def noise_from_covariance(covariance: FloatArray) -> Any:  # noqa: ANN401  # gts
     eigenvalues, vectors = np.linalg.eigh(measured)
     if measured.size and eigenvalues[0] <= 0:
         raise EstimationError(f"a covariance must be positive definite: {covariance.tolist()}")
-    if np.array_equal(measured, np.diag(np.diagonal(measured))):
+    if jacobian is None and np.array_equal(measured, np.diag(np.diagonal(measured))):
         precisions = np.zeros(len(covariance))
         precisions[is_measured] = 1 / np.diagonal(measured)
         return gtsam.noiseModel.Diagonal.Precisions(precisions)
     root = np.zeros_like(covariance)
     root[np.ix_(is_measured, is_measured)] = (vectors / np.sqrt(eigenvalues)).T
+    if jacobian is not None:
+        root = root @ jacobian
     return gtsam.noiseModel.Gaussian.SqrtInformation(root, False)  # noqa: FBT003  # smart=False
 
 
@@ -44,10 +50,11 @@ class NoiseModels:
     def __init__(self) -> None:
         self._made: dict[bytes, Any] = {}
 
-    def __call__(self, covariance: FloatArray) -> Any:  # noqa: ANN401
-        key = covariance.tobytes()
+    def __call__(self, covariance: FloatArray, jacobian: FloatArray | None = None) -> Any:  # noqa: ANN401
+        """Return the noise of a covariance, as `noise_from_covariance`."""
+        key = covariance.tobytes() + (b"" if jacobian is None else jacobian.tobytes())
         if key not in self._made:
-            self._made[key] = noise_from_covariance(covariance)
+            self._made[key] = noise_from_covariance(covariance, jacobian)
         return self._made[key]
 
 

@@ -1,0 +1,1 @@
+"""Inertial measurement units: their parameters, and the biases they start with."""
