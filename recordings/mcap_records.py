@@ -208,6 +208,32 @@ def _is_message(view: memoryview, position: int, channels: set[int]) -> bool:
         fields = Fields(view, position + PREFIX.size, end)
         if end - fields.position < MESSAGE_HEADER_SIZE or fields.number(2) not in channels:
             return False
-        return end == len(view) or prefix(view, end, len(view))[0] <= DATA_END
     except DamageError:
         return False
+    return may_start(view, end)
+
+
+def may_start(view: memoryview, position: int) -> bool:
+    """Say whether a record, or nothing but the file's end, lies here."""
+    try:
+        return position == len(view) or prefix(view, position, len(view))[0] <= DATA_END
+    except DamageError:
+        return False
+
+
+def swallowed(view: memoryview, position: int, end: int, channels: set[int]) -> int | None:
+    """Find the first message that lies inside a record outside of chunks, whose length is a lie then.
+
+    A payload may hold what looks like a message. So where the record ends at another, all that follows the
+    first message must be records up to that very end.
+    """
+    found = next_message(view, position + 1, end, channels)
+    if found is None or not may_start(view, end):
+        return found
+    following = found
+    while following < end:
+        try:
+            _, following = prefix(view, following, end)
+        except DamageError:
+            return None
+    return found

@@ -34,6 +34,7 @@ class _Survey:
         self._is_past_data = False
         self._damaged: list[Segment] = []
         self._next_chunk = -1  # where the last search ended
+        self._longest = 0  # of the records outside of chunks so far
 
     def walk(self) -> Layout:
         view, layout = self._view, self._layout
@@ -58,6 +59,8 @@ class _Survey:
         """Take note of one record; return where the next one is."""
         view = self._view
         opcode, end = records.prefix(view, position, len(view))
+        if opcode not in (records.CHUNK, records.DATA_END):
+            self._check_length(position, end)
         if opcode == records.MESSAGE:
             self._extend_run(position, end)
         elif opcode == records.CHUNK or (
@@ -74,6 +77,18 @@ class _Survey:
         else:
             self._layout.add(view, position, end)
         return end
+
+    def _check_length(self, position: int, end: int) -> None:
+        """Refuse a record that takes messages with it; only where its length is odd, for a search costs time.
+
+        Raises:
+            DamageError: If it does.
+        """
+        view, known = self._view, self._layout.known_ids
+        is_odd = end - position > self._longest or not records.may_start(view, end)
+        if is_odd and records.swallowed(view, position, end, known) is not None:
+            raise DamageError("a record whose length takes in other messages")
+        self._longest = max(self._longest, end - position)
 
     def _skip(self, position: int, reason: str) -> int:
         """Find the next readable record behind damage, and count what lies between."""
