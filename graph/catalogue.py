@@ -24,6 +24,7 @@ OperatorType = type[Operator[Any, Any]]
 
 BUILT_IN = {
     "cloud_sink": "mapstream.operators.sinks.cloud:CloudSink",
+    "external_loops": "mapstream.operators.submaps.external_loops:ExternalLoops",
     "gicp_odometry": "mapstream.operators.odometry.gicp_odometry:GicpOdometry",
     "image_decode": "mapstream.operators.decode.image:ImageDecode",
     "keyframes": "mapstream.operators.submaps.keyframes:Keyframes",

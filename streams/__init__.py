@@ -5,7 +5,12 @@ from mapstream.streams.channel import Channel, Limits, Receiver, Sender
 from mapstream.streams.clock import Clock, ReplayClock, TestClock, WallClock
 from mapstream.streams.errors import MappingError
 from mapstream.streams.geometry import SE3
-from mapstream.streams.messages.constraints import Constraint, LandmarkRef, OuterFrame
+from mapstream.streams.messages.constraints import (
+    Constraint,
+    LandmarkRef,
+    LoopClosure,
+    OuterFrame,
+)
 from mapstream.streams.messages.estimates import (
     ImageFeatures,
     Keyframe,
@@ -60,6 +65,7 @@ __all__ = [
     "LidarScan",
     "Limits",
     "LoopCandidate",
+    "LoopClosure",
     "LoopReport",
     "MapCorrection",
     "MappingError",

@@ -6,17 +6,16 @@ Source: Cramariuc et al., maplab 2.0, RA-L 2023, section III-A1 (external loop c
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 
-from mapstream.operators.maps.composing import Motion
-from mapstream.operators.maps.missions import find_mission, nearest_vertices
+from mapstream.operators.maps.external_loops import End, edge_between, end_at
+from mapstream.operators.maps.missions import find_mission
 from mapstream.recordings.maps.build import add_edges
 from mapstream.recordings.maps.model import Map
 from mapstream.recordings.maps.tables import BoolArray
 from mapstream.streams.errors import MapError
-from mapstream.streams.geometry import SE3
 from mapstream.streams.messages.estimates import RelativePose
 from mapstream.streams.trajectory import Trajectory
 
@@ -58,38 +57,22 @@ class _Ends:
         self._trajectories: dict[int, Trajectory] = {}
 
     def between_vertices(self, loop: RelativePose) -> RelativePose:
-        """Return the loop from vertex to vertex: T_va_vb = T_va_a T_a_b T_b_vb.
+        """Return the loop from vertex to vertex.
 
         Raises:
             MapError: If an end lies outside its mission, or both lie at one vertex.
         """
-        mission_a, vertex_a, T_va_a = self._end(loop.mission_a, loop.stamp_a_ns)
-        mission_b, vertex_b, T_vb_b = self._end(loop.mission_b, loop.stamp_b_ns)
-        if (mission_a, vertex_a) == (mission_b, vertex_b):
-            raise MapError("both ends lie at one vertex")
-        measured = Motion(loop.T_a_b, loop.covariance)
-        moved = Motion.exact(T_va_a).then(measured).then(Motion.exact(T_vb_b.inverse()))
-        return replace(
-            loop,
-            mission_a=mission_a,
-            stamp_a_ns=vertex_a,
-            mission_b=mission_b,
-            stamp_b_ns=vertex_b,
-            T_a_b=moved.T,
-            covariance=moved.covariance,
-        )
+        a = self._end(loop.mission_a, loop.stamp_a_ns)
+        return edge_between(loop, a, self._end(loop.mission_b, loop.stamp_b_ns))
 
-    def _end(self, mission: str, stamp_ns: int) -> tuple[str, int, SE3]:
-        """Return the mission's id, the stamp of its nearest vertex, and T_vertex_stamp."""
+    def _end(self, mission: str, stamp_ns: int) -> End:
         if mission not in self._rows:
             self._rows[mission] = find_mission(self._map, mission)
         row = self._rows[mission]
         mission_id = self._map.mission_id(row)
-        vertex = nearest_vertices(self._map, row, np.array([stamp_ns]))[0]
         if row not in self._trajectories:
             self._trajectories[row] = self._map.trajectory(mission_id)
-        vertex_ns = int(self._map.vertices.stamp_ns[vertex])
-        return mission_id, vertex_ns, self._trajectories[row].between(vertex_ns, stamp_ns)
+        return end_at(mission_id, self._trajectories[row], stamp_ns)
 
 
 def delete_loops(

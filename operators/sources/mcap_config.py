@@ -10,7 +10,7 @@ from pydantic import Field, NonNegativeFloat, PositiveFloat, field_validator
 from mapstream.operators.operator import OperatorConfig
 from mapstream.recordings.message_codec import known_messages
 from mapstream.streams.calibration import CameraCalibration
-from mapstream.streams.messages.constraints import Constraint
+from mapstream.streams.messages.constraints import Constraint, LoopClosure
 from mapstream.streams.messages.estimates import Odometry, PointCloud
 from mapstream.streams.messages.sensors import (
     CameraFrame,
@@ -36,6 +36,7 @@ _TYPES: dict[str, type[Any]] = {  # by the name of a port
     "transforms": TransformBatch,
     "calibrations": CameraCalibration,
     "constraints": Constraint,
+    "loops": LoopClosure,
     "biases": ImuBatch,
 }
 

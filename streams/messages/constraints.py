@@ -59,3 +59,24 @@ class Constraint:
 
     def __post_init__(self) -> None:
         frozen(self, "covariance", np.float64, (6, 6))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class LoopClosure:
+    """Where one robot was at one time, seen from where it or another was at another time."""
+
+    robot_a: str  # the id of a mission, its first digits, or a name that the receiver knows
+    stamp_a_ns: int
+    robot_b: str
+    stamp_b_ns: int
+    T_a_b: SE3  # from the base of b at its time to the base of a at its time
+    covariance: FloatArray  # (6, 6) rotation first [rad, m]
+    quality: float = 1.0  # as its finder rates it, more is better
+    source: str = ""  # who found it
+
+    def __post_init__(self) -> None:
+        frozen(self, "covariance", np.float64, (6, 6))
+
+    @property
+    def stamp_ns(self) -> int:
+        return max(self.stamp_a_ns, self.stamp_b_ns)

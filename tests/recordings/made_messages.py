@@ -7,7 +7,12 @@ import numpy as np
 
 from mapstream.streams.calibration import CameraCalibration
 from mapstream.streams.geometry import SE3
-from mapstream.streams.messages.constraints import Constraint, LandmarkRef, OuterFrame
+from mapstream.streams.messages.constraints import (
+    Constraint,
+    LandmarkRef,
+    LoopClosure,
+    OuterFrame,
+)
 from mapstream.streams.messages.estimates import (
     ImageFeatures,
     Keyframe,
@@ -94,12 +99,17 @@ def one_of_each(seed: int) -> list[Any]:
         outer=maybe(OuterFrame(name="enu", crs="enu", origin_lla=maybe(np.array([47.0, 8.0, 400.0])))),
         landmark=maybe(LandmarkRef(name="door", kind="plane", label="wall")), payload=rng.bytes(n),
     )  # fmt: skip
+    loop = LoopClosure(
+        robot_a="one", stamp_a_ns=1, robot_b=mission, stamp_b_ns=2, T_a_b=pose(), covariance=covariance(),
+        quality=float(rng.random()), source="radio",
+    )  # fmt: skip
     splice = Splice(keyframe=keyframe, edges=(edge, edge), constraints=(constraint,))
     imu = ImuBatch(
         stamps_ns=np.arange(n + 1), gyro_radps=rng.normal(size=(n + 1, 3)),
         accel_mps2=rng.normal(size=(n + 1, 3)), is_saturated=maybe(np.zeros(n + 1, bool)),
     )  # fmt: skip
     return [
+        loop,
         LidarScan(
             stamp_ns=stamp, points=points, intensity=maybe(intensity),
             ring=maybe(np.arange(n, dtype=np.uint16)), offsets_ns=maybe(np.arange(n) - 2),

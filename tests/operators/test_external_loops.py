@@ -1,0 +1,167 @@
+"""Loops that others found become edges between the nearest vertices, exact to their stamps."""
+
+from __future__ import annotations
+
+import re
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from mapstream.operators.operator import Context
+from mapstream.operators.submaps.external_loops import ExternalLoops, ExternalLoopsConfig
+from mapstream.operators.testing import run_operator
+from mapstream.streams.geometry import SE3
+from mapstream.streams.messages.constraints import LoopClosure
+from mapstream.streams.messages.estimates import Keyframe, LoopReport, Odometry, Submap
+
+pytestmark = pytest.mark.anyio
+
+ONE, TWO = "1" * 32, "2" * 32
+RATES = {ONE: [0, 0, 0.2, 1.0, 0.1, 0], TWO: [0.1, 0, -0.3, 0.5, 0, 0.2]}  # per second
+STARTS = {ONE: SE3.identity(), TWO: SE3.exp([0.3, 0.1, -0.5, 4, 5, 6])}  # in the map
+TIGHT = np.diag([1e-4] * 3 + [1e-2] * 3)
+SECOND = 1_000_000_000
+
+
+def odometry(mission: str, stamp_ns: int) -> SE3:
+    """A screw, along which interpolation between keyframes is exact."""
+    return SE3.exp(np.array(RATES[mission]) * stamp_ns / SECOND)
+
+
+def place(mission: str, stamp_ns: int) -> SE3:
+    return STARTS[mission] @ odometry(mission, stamp_ns)
+
+
+def submap(mission: str, index: int, *seconds: int) -> Submap:
+    keyframes = [
+        Keyframe(
+            stamp_ns=s * SECOND,
+            odometry=Odometry(stamp_ns=s * SECOND, T_odom_base=odometry(mission, s * SECOND)),
+        )
+        for s in seconds
+    ]
+    return Submap(mission_id=mission, index=index, keyframes=tuple(keyframes), edges=())
+
+
+def loop(a: str, stamp_a_ns: int, b: str, stamp_b_ns: int, **options: object) -> LoopClosure:
+    T_a_b = place(a, stamp_a_ns).inverse() @ place(b, stamp_b_ns)
+    fields = {"covariance": TIGHT, "source": "radio", "robot_a": a, "robot_b": b} | options
+    return LoopClosure(stamp_a_ns=stamp_a_ns, stamp_b_ns=stamp_b_ns, T_a_b=T_a_b, **fields)  # type: ignore[arg-type]  # made up
+
+
+async def reports_of(
+    loops: list[LoopClosure],
+    submaps: list[Submap],
+    config: ExternalLoopsConfig | None = None,
+    reports: list[LoopReport] | None = None,
+) -> tuple[list[LoopReport], Context]:
+    found = Context()
+    operator = ExternalLoops(config or ExternalLoopsConfig())
+    inputs = {"loops": loops, "submaps": submaps} | (
+        {} if reports is None else {"reports": reports}
+    )
+    sent = await run_operator(operator, run_context=found, **inputs)  # type: ignore[arg-type]  # ports by name
+    return sent["loops"], found
+
+
+@settings(max_examples=15, deadline=None)
+@given(a_ns=st.integers(1, 10 * SECOND), b_ns=st.integers(1, 10 * SECOND))
+async def test_A15_a_loop_becomes_one_edge_exact_to_its_stamps(a_ns: int, b_ns: int) -> None:
+    """Wherever its instants lie, the edge is the true motion between the vertices nearest to them."""
+    submaps = [submap(ONE, 0, 0, 2, 5, 10), submap(TWO, 0, 0, 3, 6, 10)]
+
+    (first, second), _ = await reports_of([loop(ONE, a_ns, TWO, b_ns)], submaps)
+
+    (edge,) = (*first.edges, *second.edges)
+    assert abs(edge.stamp_a_ns - a_ns) == min(abs(s * SECOND - a_ns) for s in (0, 2, 5, 10))
+    assert abs(edge.stamp_b_ns - b_ns) == min(abs(s * SECOND - b_ns) for s in (0, 3, 6, 10))
+    expected = place(ONE, edge.stamp_a_ns).inverse() @ place(TWO, edge.stamp_b_ns)
+    np.testing.assert_allclose(edge.T_a_b.matrix, expected.matrix, atol=1e-6)  # a micrometre
+    assert (edge.kind, edge.mission_a, edge.mission_b, edge.source) == ("loop", ONE, TWO, "radio")
+    assert edge.is_switchable
+    carried = odometry(TWO, b_ns).inverse() @ odometry(TWO, edge.stamp_b_ns)
+    adjoint = carried.inverse().adjoint()
+    np.testing.assert_allclose(edge.covariance, adjoint @ TIGHT @ adjoint.T, atol=1e-6)
+
+
+async def test_A15_a_loop_waits_for_the_submaps_of_both_its_ends() -> None:
+    submaps = [
+        submap(ONE, 0, 0, 2),
+        submap(ONE, 1, 2, 4),
+        submap(TWO, 0, 0, 5),
+        submap(ONE, 2, 4, 6),
+    ]
+    loops = [loop(ONE, SECOND, TWO, SECOND), loop(ONE, SECOND, ONE, 4 * SECOND)]
+
+    reports, found = await reports_of(loops, submaps)
+
+    assert [len(report.edges) for report in reports] == [0, 1, 1, 0]
+    assert [report.stamp_ns for report in reports] == [s.stamp_ns for s in submaps]
+    assert found.activity.losses == {}
+
+
+@pytest.mark.parametrize(
+    ("options", "reason"),
+    [
+        ({"quality": 0.2}, "its quality is 0.2, below 0.5"),
+        ({"quality": float("nan")}, "its quality is nan, below 0.5"),
+        ({"covariance": np.zeros((6, 6))}, "its covariance is not positive definite"),
+        ({"covariance": np.full((6, 6), np.inf)}, "its covariance is not symmetric and finite"),
+        ({"stamp_b_ns": 4 * SECOND + 1}, "both ends lie at one vertex"),
+        (
+            {"stamp_b_ns": 5},
+            "5 ns lies outside mission 1{32}, which spans .*; it looks like seconds",
+        ),
+        ({"robot_b": ""}, "both ends lie at one vertex"),
+    ],
+)
+async def test_U2_every_rejected_loop_says_why(options: dict[str, object], reason: str) -> None:
+    stamp_b_ns = int(options.pop("stamp_b_ns", 4 * SECOND))  # type: ignore[call-overload]  # made up
+    made = loop(ONE, 4 * SECOND, ONE, stamp_b_ns, **options)
+
+    (report,), found = await reports_of(
+        [made], [submap(ONE, 0, 4, 6, 8)], ExternalLoopsConfig(min_quality=0.5)
+    )
+
+    (candidate,) = report.candidates
+    assert report.edges == ()
+    assert re.match(reason, candidate.verdict), candidate.verdict
+    assert list(found.activity.warnings) == [f"a loop was rejected: {candidate.verdict}"]
+
+
+async def test_loops_that_never_find_a_place_are_counted_as_lost() -> None:
+    loops = [loop(ONE, SECOND, TWO, SECOND), loop(ONE, SECOND, ONE, 99 * SECOND)]
+
+    _, found = await reports_of(loops, [submap(ONE, 0, 0, 2), submap(ONE, 1, 2, 3)])
+
+    assert set(found.activity.losses) == {
+        f"a loop that found no place: no mission of robot {TWO!r} came; there are {[ONE]}",
+        f"a loop that found no place: mission {ONE} ends before 99000000000 ns",
+    }
+
+
+async def test_robots_are_named_by_digits_or_by_the_config() -> None:
+    """No digits are enough where there is one mission alone."""
+    named = ExternalLoopsConfig(robots={"rover": TWO[:4]})
+    two = [submap(ONE, 0, 0, 2), submap(TWO, 0, 0, 2)]
+    made = loop(ONE, SECOND, TWO, SECOND, robot_a=ONE[:6], robot_b="rover")
+    alone = loop(ONE, SECOND, ONE, 9 * SECOND, robot_a="husky", robot_b="husky")
+
+    several, _ = await reports_of([made], two, named)
+    only = ExternalLoopsConfig(robots={"husky": ""})
+    one, _ = await reports_of([alone], [submap(ONE, 0, 0, 9)], only)
+
+    assert [edge.mission_b for report in several for edge in report.edges] == [TWO]
+    assert [len(report.edges) for report in one] == [1]
+
+
+async def test_what_another_search_found_stays() -> None:
+    submaps = [submap(ONE, 0, 0, 2)]
+    edges = (await reports_of([loop(ONE, 0, ONE, 2 * SECOND)], submaps))[0][0].edges
+    other = LoopReport(stamp_ns=2 * SECOND, edges=edges)
+
+    (report,), _ = await reports_of([loop(ONE, 0, ONE, 2 * SECOND)], submaps, reports=[other])
+
+    assert len(report.edges) == 2
