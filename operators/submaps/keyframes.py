@@ -14,6 +14,7 @@ from mapstream.streams.errors import EstimationError
 from mapstream.streams.messages.estimates import Keyframe, Odometry, PointCloud
 from mapstream.streams.messages.sensors import FloatArray
 from mapstream.streams.sync import exact
+from mapstream.streams.triggers import AnyOf, OnMotion, Periodic, Trigger
 
 
 class KeyframesConfig(OperatorConfig):
@@ -55,11 +56,9 @@ class Keyframes(Operator[Inputs, Outputs]):
         self._config = config
         sigmas = [config.odometry_sigma_rad] * 3 + [config.odometry_sigma_m] * 3
         self._default_covariance = np.diag(np.square(sigmas))
-        self._kept: Odometry | None = None  # the last keyframe
+        self._trigger = _trigger(config)
         self._previous: Odometry | None = None  # the last message
-        self._covariance: FloatArray = np.zeros(
-            (6, 6)
-        )  # of the step from the kept one to the previous
+        self._covariance: FloatArray = np.zeros((6, 6))  # from the last keyframe to the previous
         self._was_lost = False
 
     async def run(self, inputs: Inputs, outputs: Outputs) -> None:
@@ -74,8 +73,8 @@ class Keyframes(Operator[Inputs, Outputs]):
                 continue
             keyframe = self.moment(odometry, cloud)
             waiting = keyframe
-            if self.is_due(odometry):
-                self.keep(odometry)
+            if self._trigger.fires(odometry.stamp_ns, odometry.T_odom_base):
+                self._covariance, self._was_lost = np.zeros((6, 6)), False
                 waiting = None
                 await outputs.keyframes.send(keyframe)
         if waiting is not None:
@@ -105,23 +104,12 @@ class Keyframes(Operator[Inputs, Outputs]):
             stamp_ns=odometry.stamp_ns, odometry=since_kept, cloud=cloud, records=records
         )
 
-    def is_due(self, odometry: Odometry) -> bool:
-        """Return whether enough happened since the last keyframe."""
-        if self._kept is None:
-            return True
-        step = self._kept.T_odom_base.inverse() @ odometry.T_odom_base
-        waited_s = (odometry.stamp_ns - self._kept.stamp_ns) / 1e9
-        return (
-            float(np.linalg.norm(step.t)) >= self._config.distance_m
-            or step.angle_rad >= self._config.rotation_rad
-            or (self._config.period_s is not None and waited_s >= self._config.period_s)
-        )
 
-    def keep(self, odometry: Odometry) -> None:
-        """Measure from this moment on."""
-        self._kept = odometry
-        self._covariance = np.zeros((6, 6))
-        self._was_lost = False
+def _trigger(config: KeyframesConfig) -> Trigger:
+    triggers: list[Trigger] = [OnMotion(config.distance_m, config.rotation_rad)]
+    if config.period_s is not None:
+        triggers.append(Periodic(round(config.period_s * 1e9)))
+    return AnyOf(triggers)
 
 
 async def _moments(inputs: Inputs) -> AsyncIterator[tuple[Odometry, PointCloud | None]]:

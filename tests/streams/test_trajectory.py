@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from mapstream.streams.geometry import SE3, se3_exp
 from mapstream.streams.trajectory import Trajectory
-from mapstream.streams.triggers import Always, OnMotion, Periodic
+from mapstream.streams.triggers import Always, AnyOf, OnMotion, Periodic
 
 SECOND = 1_000_000_000
 TWIST = np.array([0.1, -0.2, 0.3, 1.0, 0.5, -0.2])  # per second
@@ -114,6 +114,19 @@ def test_B16_on_motion_fires_by_distance_or_by_angle() -> None:
     ]
 
     assert fired == [True, False, True, False, True, False, True]
+
+
+def test_B16_any_of_several_restarts_all() -> None:
+    """A metre after 3 s also begins the period of 5 s anew: the next is due at 8 s, not at 5 s."""
+    trigger = AnyOf([OnMotion(1.0, 0.5), Periodic(5 * SECOND)])
+
+    fired = [
+        t
+        for t in range(10)
+        if trigger.fires(t * SECOND, SE3.exp([0, 0, 0, 1.0 if t >= 3 else 0.0, 0, 0]))
+    ]
+
+    assert fired == [0, 3, 8]
 
 
 def test_B16_always_fires_always() -> None:
