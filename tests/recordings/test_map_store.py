@@ -172,7 +172,7 @@ for trial in range(1000):
         for step in itertools.islice(itertools.cycle(steps), trial % len(steps), None):
             with contextlib.suppress(MapError):  # nothing to undo, where the one before ended
                 step()
-    time.sleep(rng.uniform(0.0, all_steps_s))
+    time.sleep(rng.uniform(0.0, all_steps_s / 2))
     os.kill(child, signal.SIGKILL)
     os.waitpid(child, 0)
     manifest = read_manifest(folder)
