@@ -18,11 +18,11 @@ from mapstream.operators.maps.edit import (
     set_uncertainty,
 )
 from mapstream.operators.maps.merge import merge
-from mapstream.operators.maps.missions import find_mission, nearest_vertices
+from mapstream.operators.maps.missions import find_mission
 from mapstream.recordings.maps import Map, check_map
 from mapstream.streams.errors import MapError
 from mapstream.streams.geometry import SE3
-from tests.recordings.made_maps import MISSION, OTHER_MISSION, STEP_NS, full_map, line_map
+from tests.recordings.made_maps import MISSION, OTHER_MISSION, full_map, line_map
 
 
 def unchanged_tables(a: Map, b: Map) -> set[str]:
@@ -108,12 +108,3 @@ def test_missions_are_found_by_digits_and_by_name() -> None:
         find_mission(map_, "line")
     with pytest.raises(MapError, match="no mission is called 'x'"):
         find_mission(map_, "x")
-
-
-def test_the_nearest_vertex_is_the_earlier_of_two() -> None:
-    map_ = line_map(4)
-    stamps_ns = 1_000 + np.array([0, STEP_NS // 2, STEP_NS // 2 + 1, 3 * STEP_NS])
-
-    assert nearest_vertices(map_, 0, stamps_ns).tolist() == [0, 0, 1, 3]
-    with pytest.raises(MapError, match=r"7 ns lies outside mission .* spans 1000 to"):
-        nearest_vertices(map_, 0, np.array([7]))
