@@ -1,0 +1,46 @@
+"""How a map is optimised, as its user says it."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import BaseModel, ConfigDict, Field, PositiveFloat, PositiveInt
+
+from mapstream.operators.estimation.fixing import Fixable
+
+Loss = Literal["huber", "cauchy", "geman_mcclure", "tukey"]
+
+
+class OptimizeConfig(BaseModel):
+    """How a map is optimised."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True)
+
+    solver: Literal["lm", "dogleg", "sparse"] = "lm"
+    """`sparse` is a second implementation, on SciPy, of poses alone: for checks."""
+    start: Literal["auto", "current", "chordal"] = "auto"
+    """Where the poses begin; auto tries the chordal start where the current one ends in a contradiction."""
+    max_iterations: PositiveInt = 100
+    """Of each descent; there are several where loops are switched."""
+    max_seconds: PositiveFloat | None = None
+    """No iteration begins after this time; the best so far is the result."""
+    initial_lambda: PositiveFloat = 1e-5
+    """The damping of the first iteration; the report of an earlier run has the one it ended with."""
+    is_robust: bool = True
+    """Switchable edges may be switched off."""
+    gate_probability: float = Field(default=0.9999, gt=0, lt=1)
+    """A switchable edge whose chi2 a true one stays below this often is false."""
+    kinds: tuple[str, ...] | None = None
+    """The kinds of edges that take part; left out, all do."""
+    without: tuple[str, ...] = ()
+    """Kinds of edges that do not take part."""
+    losses: dict[str, Loss] = {}
+    """A robust loss by kind of edge, for instance `odometry: huber`; others are squared."""
+    loss_width: PositiveFloat = 3.0
+    """Where losses begin to flatten, in standard deviations."""
+    fix: tuple[Fixable, ...] = ()
+    """Variables that stay as they are: poses, velocities, biases, landmarks, frames, extrinsics."""
+    underconstrained: Literal["error", "prior"] = "error"
+    """What happens to variables that the edges do not determine: a weak prior holds them, or none."""
+    reject_absolute: bool = False
+    """Absolute measurements that contradict the others are switched off first."""
