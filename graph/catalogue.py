@@ -39,6 +39,7 @@ BUILT_IN = {
     "optimizer": "mapstream.operators.backend.optimizer:Optimizer",
     "orb": "mapstream.operators.tracking.orb:Orb",
     "submap_builder": "mapstream.operators.submaps.submap_builder:SubmapBuilder",
+    "thin": "mapstream.operators.flow.thin:Thin",
     "trajectory": "mapstream.operators.trajectory.trajectory:Trajectory",
     "trajectory_sink": "mapstream.operators.sinks.trajectory:TrajectorySink",
 }

@@ -14,6 +14,7 @@ from importlib.metadata import entry_points
 from typing import cast
 
 from mapstream.graph.metrics import Snapshot
+from mapstream.graph.views.constraints import view_constraint
 from mapstream.graph.views.images import (
     view_camera_frame,
     view_encoded_image,
@@ -38,7 +39,7 @@ from mapstream.graph.views.run import operator_graph, view_snapshot
 from mapstream.graph.views.scene import Columns, Entry, Scene, View, ViewSettings
 from mapstream.graph.views.unknown import view_unknown
 from mapstream.recordings.maps import Map
-from mapstream.streams.messages import estimates, sensors
+from mapstream.streams.messages import constraints, estimates, sensors
 
 __all__ = [
     "GROUP",
@@ -62,6 +63,7 @@ _BUILT_IN: dict[type, View] = {
     sensors.GnssFix: view_gnss_fix,
     sensors.WheelOdometry: view_wheel_odometry,
     sensors.TransformBatch: view_transforms,
+    constraints.Constraint: view_constraint,
     estimates.Odometry: view_odometry,
     estimates.PointCloud: view_point_cloud,
     estimates.Keyframe: view_keyframe,

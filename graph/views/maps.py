@@ -1,4 +1,4 @@
-"""A map as it is stored: missions, loops by their switch, other edges, landmarks."""
+"""A map as it is stored: missions, loops by their switch, other edges, landmarks, outer frames."""
 
 from __future__ import annotations
 
@@ -6,9 +6,12 @@ import numpy as np
 import rerun as rr
 
 from mapstream.graph.views.ceiling import without_ceiling
-from mapstream.graph.views.colors import ramp_colors, switch_colors
+from mapstream.graph.views.colors import switch_colors
+from mapstream.graph.views.constraints import place_frames
 from mapstream.graph.views.growing import LINE, MAP_PATH, redraw_loops, redraw_mission
+from mapstream.graph.views.landmarks import landmark_entries
 from mapstream.graph.views.lidar import height_colors
+from mapstream.graph.views.outer_frames import outer_frame_entries
 from mapstream.graph.views.scene import Columns, Drawing, Entry, Scene, Vertex
 from mapstream.recordings.maps import Map
 from mapstream.streams.messages.estimates import PointCloud
@@ -18,7 +21,7 @@ _QUIET = ("odometry", "imu", "loop")  # along the trajectory, or drawn with the 
 
 
 def view_map(map_: Map, scene: Scene) -> Drawing:
-    """Draw each mission's trajectory, loops by switch value, other edges and landmarks by kind."""
+    """Draw each mission's trajectory, loops by switch value, other edges and landmarks by kind, outer frames."""
     drawing: list[Entry | Columns] = []
     for row in range(len(map_.missions)):
         vertices = map_.vertices_of(row)
@@ -28,7 +31,8 @@ def view_map(map_: Map, scene: Scene) -> Drawing:
     for edge in map_.edges_of("loop"):
         ends = _vertex(map_, edges.vertex_a[edge]), _vertex(map_, edges.vertex_b[edge])
         scene.loops[ends] = float(edges.switch[edge])
-    return [*drawing, *redraw_loops(scene), *_edges(map_), *_landmarks(map_)]
+    drawing += [*redraw_loops(scene), *place_frames(map_)]
+    return [*drawing, *_edges(map_), *_landmarks(map_)]
 
 
 def cloud_entry(map_: Map, cloud: PointCloud, scene: Scene) -> Entry:
@@ -56,20 +60,4 @@ def _edges(map_: Map) -> list[Entry]:
         lines = np.stack(ends, axis=1).astype(np.float32)
         strips = rr.LineStrips3D(lines, colors=switch_colors(edges.switch[rows]), radii=LINE)
         drawing.append(Entry.of(f"{MAP_PATH}/edges/{kind}", strips))
-    return drawing
-
-
-def _landmarks(map_: Map) -> list[Entry]:
-    """Return the landmarks, a path per kind, coloured by height."""
-    drawing = []
-    landmarks = map_.landmarks
-    for kind in dict.fromkeys(landmarks.kind):
-        rows = np.flatnonzero(landmarks.kind == kind)
-        T_map_base = map_.T_map_base(landmarks.vertex[rows])
-        p_base = landmarks.p_base[rows, :, None]
-        points = (T_map_base[:, :3, :3] @ p_base)[..., 0] + T_map_base[:, :3, 3]
-        low, high = np.percentile(points[:, 2], [2, 98])
-        colors = ramp_colors(points[:, 2], float(low), float(high))
-        marks = rr.Points3D(points, colors=colors, radii=rr.Radius.ui_points(2))
-        drawing.append(Entry.of(f"{MAP_PATH}/landmarks/{kind}", marks))
     return drawing
