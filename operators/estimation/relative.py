@@ -15,6 +15,7 @@ def between(map_: Map, rows: IntArray, noise_of: NoiseModels) -> dict[int, Facto
     A direction of infinite variance has no information at all: z, roll and pitch of wheels, for instance.
     """
     edges = map_.edges
+    noise_of.prepare(edges.covariance[rows])
     ends = zip(
         rows.tolist(), edges.vertex_a[rows].tolist(), edges.vertex_b[rows].tolist(), strict=True
     )
