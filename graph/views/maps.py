@@ -32,7 +32,7 @@ def view_map(map_: Map, scene: Scene) -> Drawing:
         ends = _vertex(map_, edges.vertex_a[edge]), _vertex(map_, edges.vertex_b[edge])
         scene.loops[ends] = float(edges.switch[edge])
     drawing += [*redraw_loops(scene), *place_frames(map_)]
-    return [*drawing, *_edges(map_), *_landmarks(map_)]
+    return [*drawing, *_edges(map_), *landmark_entries(map_), *outer_frame_entries(map_)]
 
 
 def cloud_entry(map_: Map, cloud: PointCloud, scene: Scene) -> Entry:

@@ -1,0 +1,89 @@
+"""Landmarks of a stored map: points, planes within their boundaries, objects with name and axes."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import rerun as rr
+
+from mapstream.graph.views.colors import AXES, ramp_colors
+from mapstream.graph.views.growing import MAP_PATH
+from mapstream.graph.views.scene import Entry
+from mapstream.recordings.maps import Map
+from mapstream.streams.messages.sensors import FloatArray, IntArray
+
+_PLANE = 0x56B4E9FF
+_SURFACE = 0x56B4E940  # one sees through it
+_AXIS_M = 0.3
+_SIDE_M = 1.0  # of a plane without a boundary
+_SQUARE = _SIDE_M / 2 * np.array([[-1.0, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])
+
+
+def landmark_entries(map_: Map) -> list[Entry]:
+    """Return the landmarks, a path per kind."""
+    drawing = []
+    for kind in dict.fromkeys(map_.landmarks.kind):
+        rows = np.flatnonzero(map_.landmarks.kind == kind)
+        path = f"{MAP_PATH}/landmarks/{rr.escape_entity_path_part(kind)}"
+        drawing += _planes(map_, rows, path) if kind == "plane" else _marks(map_, rows, path)
+    return drawing
+
+
+def axes(T_map_frame: FloatArray, length_m: float) -> rr.Arrows3D:
+    """Return the axes of frames (N, 4, 4): x red, y green, z blue."""
+    vectors = length_m * np.swapaxes(T_map_frame[:, :3, :3], 1, 2).reshape(-1, 3)
+    origins = np.repeat(T_map_frame[:, :3, 3], 3, axis=0)
+    return rr.Arrows3D(vectors=vectors, origins=origins, colors=np.tile(AXES, len(T_map_frame)))
+
+
+def _marks(map_: Map, rows: IntArray, path: str) -> list[Entry]:
+    """Return points coloured by height, with their labels and, where they are turned, their axes."""
+    poses = map_.T_map_landmark(rows)
+    low, high = np.percentile(poses[:, 2, 3], [2, 98])
+    colors = ramp_colors(poses[:, 2, 3], float(low), float(high))
+    labels = map_.landmarks.label[rows].tolist()
+    marks = rr.Points3D(
+        poses[:, :3, 3],
+        colors=colors,
+        radii=rr.Radius.ui_points(2),
+        labels=labels if any(labels) else None,
+    )
+    is_turned = np.isfinite(map_.landmarks.quat_base_xyzw[rows]).all(axis=1)
+    turned = [Entry.of(f"{path}/axes", axes(poses[is_turned], _AXIS_M))] if is_turned.any() else []
+    return [Entry.of(path, marks), *turned]
+
+
+def _planes(map_: Map, rows: IntArray, path: str) -> list[Entry]:
+    """Return the boundaries of planes, and their surfaces, which are convex."""
+    strips, vertices, triangles, first = [], [], [], 0
+    for row, T in zip(rows.tolist(), map_.T_map_landmark(rows), strict=True):
+        corners = _hull(map_.landmarks.payload[row]) @ T[:3, :3].T + T[:3, 3]
+        strips.append(np.concatenate([corners, corners[:1]]))
+        vertices.append(corners)
+        fan = np.arange(1, len(corners) - 1)
+        triangles.append(first + np.column_stack([np.zeros_like(fan), fan, fan + 1]))
+        first += len(corners)
+    labels = map_.landmarks.label[rows].tolist()
+    surface = rr.Mesh3D(
+        vertex_positions=np.concatenate(vertices).astype(np.float32),
+        triangle_indices=np.concatenate(triangles),
+        albedo_factor=_SURFACE,
+    )
+    boundaries = rr.LineStrips3D(
+        strips,
+        colors=_PLANE,
+        radii=rr.Radius.ui_points(1.5),
+        labels=labels if any(labels) else None,
+    )
+    return [Entry.of(path, boundaries), Entry.of(f"{path}/surface", surface)]
+
+
+def _hull(payload: bytes) -> FloatArray:
+    """Return the corners (N, 3) of a plane in its own frame; a square where the payload names none."""
+    try:
+        corners = np.array(json.loads(payload)["hull"], dtype=np.float64)
+    except (ValueError, KeyError, TypeError):
+        return _SQUARE
+    is_area = corners.ndim == 2 and corners.shape[1:] == (3,) and len(corners) >= 3
+    return corners if is_area and np.isfinite(corners).all() else _SQUARE
