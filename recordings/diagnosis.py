@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from mapstream.recordings.decoding import Decoder, decoder_for
+from mapstream.recordings.input_checks import InputChecks
 from mapstream.recordings.recording import Loss, RawMessage, Recording, Topic
 from mapstream.recordings.sensor_checks import CloudChecks, check_imu
 from mapstream.recordings.stamp_checks import Finding, Times, check_offsets, check_times
@@ -102,6 +103,7 @@ class _Patient:
         self._accel: list[FloatArray] = []
         self._gyro: list[FloatArray] = []
         self._clouds = CloudChecks(topic.name)
+        self._inputs = InputChecks(topic.name)
         self._errors: Counter[str] = Counter()
 
     def see(self, raw: RawMessage) -> None:
@@ -138,6 +140,8 @@ class _Patient:
             self._gyro.append(message.gyro_radps)
         elif isinstance(message, LidarScan):
             self._clouds.add(message)
+        else:
+            self._inputs.see(message)
         is_one_by_one = isinstance(message, ImuBatch) and len(message.stamps_ns) == len(raws)
         stamps_ns = message.stamps_ns.tolist() if is_one_by_one else [message.stamp_ns]
         self._stamps_ns += stamps_ns
@@ -193,4 +197,4 @@ class _Patient:
             found += check_imu(name, np.concatenate(self._accel), np.concatenate(self._gyro))
         if self._decoder is not None and self._decoder.message_type is LidarScan:
             found += self._clouds.findings(times.period_ns)
-        return found
+        return [*found, *self._inputs.findings()]
