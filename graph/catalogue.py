@@ -26,6 +26,7 @@ BUILT_IN = {
     "cloud_sink": "mapstream.operators.sinks.cloud:CloudSink",
     "external_loops": "mapstream.operators.submaps.external_loops:ExternalLoops",
     "gicp_odometry": "mapstream.operators.odometry.gicp_odometry:GicpOdometry",
+    "gnss": "mapstream.operators.gnss.positions:Gnss",
     "image_decode": "mapstream.operators.decode.image:ImageDecode",
     "keyframes": "mapstream.operators.submaps.keyframes:Keyframes",
     "kiss_odometry": "mapstream.operators.odometry.kiss_odometry:KissOdometry",

@@ -1,0 +1,1 @@
+"""Satellite positioning: from the ellipsoid to planes in which maps are made."""
