@@ -15,13 +15,15 @@ def between(map_: Map, rows: IntArray, noise_of: NoiseModels) -> dict[int, Facto
     A direction of infinite variance has no information at all: z, roll and pitch of wheels, for instance.
     """
     edges = map_.edges
-    noise_of.prepare(edges.covariance[rows])
-    ends = zip(
-        rows.tolist(), edges.vertex_a[rows].tolist(), edges.vertex_b[rows].tolist(), strict=True
+    between_of, pose_of = gtsam.BetweenFactorPose3, gtsam.Pose3
+    columns = (
+        rows.tolist(),
+        edges.vertex_a[rows].tolist(),
+        edges.vertex_b[rows].tolist(),
+        edges.T_a_b[rows],
+        noise_of.of_all(edges.covariance[rows]),
     )
     return {
-        row: gtsam.BetweenFactorPose3(
-            a, b, gtsam.Pose3(edges.T_a_b[row]), noise_of(edges.covariance[row])
-        )
-        for row, a, b in ends
+        row: between_of(a, b, pose_of(T_a_b), noise)
+        for row, a, b, T_a_b, noise in zip(*columns, strict=True)
     }
