@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import tempfile
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
-from mapstream.graph.cli.evaluate import Score, compare
+from mapstream.graph.cli.demo_data import converted, simulated
+from mapstream.graph.cli.evaluate import compare
 from mapstream.graph.cli.output import (
     ExitCode,
     JsonFlag,
@@ -22,57 +24,95 @@ from mapstream.graph.cli.output import (
 from mapstream.graph.cli.planning import Request, plan_request
 from mapstream.graph.cli.run_report import print_report, report_as_json
 from mapstream.graph.cli.running import execute
-from mapstream.graph.cli.simulate import write_world
 from mapstream.graph.problems import did_you_mean
 from mapstream.graph.trajectory_sources import read_trajectory
+from mapstream.graph.unused_positions import unused_position_errors
+from mapstream.recordings.evaluation import Statistics
 from mapstream.recordings.maps import check_map, load_map
-from mapstream.recordings.worlds.catalogue import WORLDS
 from mapstream.streams.errors import ConfigError
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class Judgement:
+    """How far the map is from what it is judged by."""
+
+    against: str
+    distance_m: Statistics
+    length_m: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Demo:
-    """A world, and the graph that maps it."""
+    """A recording that every machine can have, the graph that maps it, and what the map is judged by."""
 
     summary: str
-    world: str
-    options: dict[str, Any]
-    graph: str = "lidar"
+    record: Callable[[Path, int], Path]  # a folder and a seed -> the recording
+    graph: str
+    judge: Callable[[Path, Path], Judgement]  # the map's folder and the recording
+
+
+def _against_truth(folder: Path, recording: Path) -> Judgement:
+    score = compare(read_trajectory(folder), read_trajectory(recording), "se3")
+    error = score.errors["absolute, translation [m]"]
+    return Judgement(against="the truth", distance_m=error, length_m=score.length_m)
+
+
+def _against_unused_positions(folder: Path, recording: Path) -> Judgement:
+    found = unused_position_errors(load_map(folder), recording)
+    against = f"{found.distance_m.count} GPS positions that were not used, {found.num_used} were"
+    return Judgement(against=against, distance_m=found.distance_m, length_m=found.length_m)
+
+
+def _corridor(folder: Path, seed: int) -> Path:
+    options = {"length_m": 80.0, "lidar": {"columns": 360}}
+    return simulated("w_lid", options, folder / "drive.mcap", seed)
+
+
+def _kitti00(folder: Path, seed: int) -> Path:  # noqa: ARG001  # it lies in the cache, and is real
+    return converted("kitti00-gtsam", "gtsam")
 
 
 DEMOS = {
+    "kitti00": Demo(
+        summary="a real car, KITTI 00: IMU, and GPS every ten seconds",
+        record=_kitti00,
+        graph="gnss_inertial",
+        judge=_against_unused_positions,
+    ),
     "corridor": Demo(
-        summary="a LiDAR in a loop of corridors",
-        world="w_lid",
-        options={"length_m": 80.0, "lidar": {"columns": 360}},
+        summary="a simulated LiDAR in a loop of corridors",
+        record=_corridor,
+        graph="lidar",
+        judge=_against_truth,
     ),
 }
 
 
 def demo(
-    name: Annotated[str, typer.Argument(help=", ".join(DEMOS))] = "corridor",
+    name: Annotated[
+        str, typer.Argument(help="; ".join(f"{n}: {d.summary}" for n, d in DEMOS.items()) + ".")
+    ] = "corridor",
     *,
     out: Annotated[
         Path | None, typer.Option("--out", help="A folder for the results; a new one without.")
     ] = None,
-    seed: Annotated[int, typer.Option(help="Of the simulation.")] = 0,
+    seed: Annotated[int, typer.Option(help="Of a simulation.")] = 0,
     rerun: Annotated[
         str | None,
         typer.Option("--rerun", help="spawn, connect, save=FILE or off; a file in OUT without."),
     ] = None,
     json: JsonFlag = False,
 ) -> None:
-    """Simulate a drive, map it, compare the map with the truth, and say where everything is."""
+    """Map a drive, judge the map by what it was not made of, and say where everything is."""
     if name not in DEMOS:
         raise ConfigError(f"no demo {name!r}{did_you_mean(name, DEMOS)}")
     chosen = DEMOS[name]
     folder = Path(tempfile.mkdtemp(prefix="mapstream-demo-")) if out is None else out
     folder.mkdir(parents=True, exist_ok=True)
-    recording, map_folder, picture = folder / "drive.mcap", folder / "map", folder / "run.rrd"
-    config = WORLDS[chosen.world].config_type.model_validate(chosen.options)
+    map_folder, picture = folder / "map", folder / "run.rrd"
     if not json:
-        say_aside(f"simulating {chosen.summary}")
-    write_world(chosen.world, recording, config, seed=seed)
+        say_aside(chosen.summary)
+    recording = chosen.record(folder, seed)
     request = Request(
         graph=chosen.graph,
         recording=recording,
@@ -85,28 +125,27 @@ def demo(
         print_report(report)
         raise typer.Exit(report.exit_code)
     violations = check_map(load_map(map_folder), map_folder)
-    score = compare(read_trajectory(map_folder), read_trajectory(recording), "se3")
+    judgement = chosen.judge(map_folder, recording)
     if json:
-        results = {"folder": folder, "score": score, "violations": violations, "viewer": notes}
-        say_json(report_as_json(report) | results)
+        results = {"folder": folder, "recording": recording, "judgement": judgement}
+        say_json(report_as_json(report) | results | {"violations": violations, "viewer": notes})
     else:
         print_report(report)
         say()
-        _tell(score, folder, map_folder)
+        _tell(judgement, folder, recording)
     for violation in violations:
         complain(str(violation))
     raise typer.Exit(ExitCode.FAILED if violations else report.exit_code)
 
 
-def _tell(score: Score, folder: Path, map_folder: Path) -> None:
+def _tell(judgement: Judgement, folder: Path, recording: Path) -> None:
     """Say how good the map is, where everything lies, and what one may do next."""
-    error = score.errors["absolute, translation [m]"]
-    say(
-        f"against the truth: {error.rmse:.3f} m rms, {error.max:.3f} m at worst, over {score.length_m:.0f} m"
-    )
-    for path in sorted(folder.iterdir()):
+    error = judgement.distance_m
+    far = f"{error.rmse:.3f} m rms, {error.max:.3f} m at worst, over {judgement.length_m:.0f} m"
+    say(f"against {judgement.against}: {far}")
+    for path in sorted({*folder.iterdir(), recording}):
         say(f"  {in_place(path)}")
-    say(f"next: mapstream map {in_place(map_folder)} stats")
+    say(f"next: mapstream map {in_place(folder / 'map')} stats")
     picture = folder / "run.rrd"
     if picture.exists():
         say(f"      rerun {in_place(picture)}")
