@@ -91,10 +91,8 @@ class Corridor:
 
     def _stations(self, reliefs: list[_Relief]) -> FloatArray:
         """Return distances along the ring for the grid: even, and close together at every edge."""
-        even = np.arange(0.0, self.ring.length_m, _GRID_M)
         edges = np.array([s for r in reliefs for s in (r.start_m, r.end_m)])
-        steps = (edges[:, None] + [-_EDGE_M, _EDGE_M]).ravel()
-        return np.unique(np.concatenate([even, steps, [self.ring.length_m]]))
+        return _grid(0.0, self.ring.length_m, edges)
 
     def _wall_reliefs(self) -> list[_Relief]:
         reliefs, start = [], 1.0
@@ -139,11 +137,17 @@ class Corridor:
 
 def _heights(reliefs: list[_Relief]) -> FloatArray:
     """Return heights over the floor for the grid of a wall."""
-    even = np.arange(-0.1, _HEIGHT_M + _GRID_M, _GRID_M)
-    edges = np.unique([z for r in reliefs for z in (r.bottom_m, r.top_m)])
+    edges = np.array([z for r in reliefs for z in (r.bottom_m, r.top_m)])
+    return _grid(-0.1, _HEIGHT_M + 0.4, edges)
+
+
+def _grid(start_m: float, end_m: float, edges_m: FloatArray) -> FloatArray:
+    """Return places from start to end: two at every edge between them, and even ones where no edge is near."""
+    even = np.linspace(start_m, end_m, round((end_m - start_m) / _GRID_M) + 1)
+    edges = edges_m[(edges_m > start_m + _EDGE_M) & (edges_m < end_m - _EDGE_M)]
+    gaps = np.abs(even[1:-1, None] - edges).min(axis=1, initial=np.inf)
     steps = (edges[:, None] + [-_EDGE_M, _EDGE_M]).ravel()
-    inside = (steps > even[0]) & (steps < even[-1])
-    return np.unique(np.concatenate([even, steps[inside]]))
+    return np.unique(np.concatenate([even[[0, -1]], even[1:-1][gaps > _GRID_M / 2], steps]))
 
 
 def _outstanding(

@@ -44,7 +44,7 @@ class WLidConfig(BaseModel):
     """Length of the loop, once round."""
     overlap_fraction: NonNegativeFloat = 0.08
     """The part of the loop that is driven a second time."""
-    speed_mps: PositiveFloat = 2.8
+    speed_mps: PositiveFloat = 3.2
     """Speed on the straight; corners are slower."""
     odometry_drift: NonNegativeFloat = 0.005
     """Drift of the topic `/odometry`, as a part of the distance."""

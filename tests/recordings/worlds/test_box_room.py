@@ -24,6 +24,23 @@ def test_rays_meet_a_box_where_geometry_says() -> None:
     assert (away.faces == -1).all()
 
 
+def test_a_caster_that_is_moved_about_sees_what_one_tree_of_all_faces_shows() -> None:
+    """What is gathered around one place is no excuse at another; rays reach across a hall of 90 m."""
+    mesh, rng = box_room(2, size_m=90.0), np.random.default_rng(3)
+    moved = RayCaster(mesh)
+
+    for x in (-40.0, -39.0, 0.0, 40.0):
+        origins = np.array([x, 0.0, 1.0]) + rng.uniform(-0.5, 0.5, (400, 3))
+        directions = rng.normal(size=(400, 3))
+        directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+        hits = moved.cast(origins, directions)
+        ranges_m, faces = moved._all.cast(origins, directions)
+        np.testing.assert_array_equal(hits.ranges_m, ranges_m)
+        np.testing.assert_array_equal(hits.faces, faces)
+        assert np.isfinite(hits.ranges_m).all()
+        assert hits.ranges_m.max() > 25.0
+
+
 def test_a_drive_ends_where_it_should() -> None:
     """Ten sweeps at 1 m/s end 1 m ahead; on a quarter circle of 2 m radius at its end."""
     straight = drive_through(box_room(1), num_scans=10)
