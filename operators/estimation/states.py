@@ -17,7 +17,7 @@ from mapstream.operators.estimation.landmark_states import insert_landmarks, wit
 from mapstream.operators.estimation.mounts import mounts, with_mounts
 from mapstream.operators.estimation.outer_frames import starting_frames
 from mapstream.recordings.maps.model import Map
-from mapstream.streams.geometry import invert
+from mapstream.streams.geometry import invert, straightened
 from mapstream.streams.messages.sensors import FloatArray, IntArray
 
 Values = Any  # gtsam has no types
@@ -134,10 +134,13 @@ def _with_poses(map_: Map, rows: IntArray, values: Values) -> Map:
         vertices = map_.vertices_of(mission)
         if len(vertices) and moves[vertices[0]]:
             first = vertices[0]
-            frames[mission] = poses[first] @ invert(map_.vertices.T_mission_base[first])
+            T_mission_base = map_.vertices.T_mission_base[first]
+            frames[mission] = straightened(poses[first] @ invert(T_mission_base))
             moves[vertices] = True
     in_mission = map_.vertices.T_mission_base.copy()
-    in_mission[moves] = (invert(frames)[map_.vertices.mission] @ poses)[moves]
+    # Straightened, or errors would double with each update: a transpose is not an inverse then.
+    T_mission_map = invert(frames)[map_.vertices.mission[moves]]
+    in_mission[moves] = straightened(T_mission_map @ poses[moves])
     return replace(
         map_,
         missions=replace(map_.missions, T_map_mission=frames),

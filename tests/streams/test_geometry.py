@@ -22,6 +22,7 @@ from mapstream.streams.geometry import (
     se3_log,
     so3_exp,
     so3_log,
+    straightened,
 )
 
 Vector = npt.NDArray[np.float64]
@@ -187,3 +188,17 @@ def test_a_transform_shows_itself_shortly() -> None:
     assert repr(SE3.exp([0, 0, 0, 1, 2, 3])) == (
         "SE3(t=[1.0, 2.0, 3.0], quat_xyzw=[0.0, 0.0, 0.0, 1.0])"
     )
+
+
+def test_a_product_of_many_rotations_is_straightened() -> None:
+    rng = np.random.default_rng(0)
+    T = se3_exp(rng.normal(size=(5, 6)))
+    bent = T.copy()
+    bent[:, :3, :3] += rng.normal(size=(5, 3, 3)) * 1e-8
+
+    straight = straightened(bent)
+
+    R = straight[:, :3, :3]
+    np.testing.assert_allclose(R @ np.swapaxes(R, 1, 2), np.tile(np.eye(3), (5, 1, 1)), atol=1e-14)
+    np.testing.assert_allclose(straight, T, atol=1e-7)
+    np.testing.assert_array_equal(straight[:, :3, 3], bent[:, :3, 3])
