@@ -28,6 +28,7 @@ BUILT_IN = {
     "gicp_odometry": "mapstream.operators.odometry.gicp_odometry:GicpOdometry",
     "gnss": "mapstream.operators.gnss.positions:Gnss",
     "image_decode": "mapstream.operators.decode.image:ImageDecode",
+    "imu_biases": "mapstream.operators.imu.biases:ImuBiases",
     "keyframes": "mapstream.operators.submaps.keyframes:Keyframes",
     "kiss_odometry": "mapstream.operators.odometry.kiss_odometry:KissOdometry",
     "lidar_loops": "mapstream.operators.lidar.loops:LidarLoops",
@@ -40,7 +41,6 @@ BUILT_IN = {
     "optimizer": "mapstream.operators.backend.optimizer:Optimizer",
     "orb": "mapstream.operators.tracking.orb:Orb",
     "submap_builder": "mapstream.operators.submaps.submap_builder:SubmapBuilder",
-    "thin": "mapstream.operators.flow.thin:Thin",
     "trajectory": "mapstream.operators.trajectory.trajectory:Trajectory",
     "trajectory_sink": "mapstream.operators.sinks.trajectory:TrajectorySink",
 }

@@ -24,7 +24,7 @@ from mapstream.streams.errors import EstimationError
 from mapstream.streams.messages.sensors import FloatArray, IntArray
 
 _SATURATED = 100.0  # times the noise of a sample that hit its limit
-_MAX_GAP_NS = 100_000_000  # without a sample, at the ends and between
+_MAX_GAP_NS = 1_000_000_000  # without a sample; whoever makes edges may ask for less
 _INTEGRATION_M = 1e-4  # [m/sqrt(s)] of the integration itself
 
 
