@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated
 
@@ -27,9 +27,11 @@ from mapstream.graph.cli.running import execute
 from mapstream.graph.problems import did_you_mean
 from mapstream.graph.trajectory_sources import read_trajectory
 from mapstream.graph.unused_positions import unused_position_errors
+from mapstream.recordings.attached_rig import rig_of
 from mapstream.recordings.evaluation import Statistics
 from mapstream.recordings.maps import check_map, load_map
 from mapstream.streams.errors import ConfigError
+from mapstream.streams.sensors import ImuSensor
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -49,6 +51,7 @@ class Demo:
     record: Callable[[Path, int], Path]  # a folder and a seed -> the recording
     graph: str
     judge: Callable[[Path, Path], Judgement]  # the map's folder and the recording
+    params: Callable[[Path], dict[str, str]] = lambda _: {}  # of the graph, for the recording
 
 
 def _against_truth(folder: Path, recording: Path) -> Judgement:
@@ -72,12 +75,20 @@ def _kitti00(folder: Path, seed: int) -> Path:  # noqa: ARG001  # it lies in the
     return converted("kitti00-gtsam", "gtsam")
 
 
+def _inertial_params(recording: Path) -> dict[str, str]:
+    """Return the noise of the IMU that the recording brings with it, and how few positions are used."""
+    imu = rig_of(recording).select("imu")
+    noise = asdict(imu.noise) if isinstance(imu, ImuSensor) and imu.noise is not None else {}
+    return {"position_period_s": "10"} | {name: repr(density) for name, density in noise.items()}
+
+
 DEMOS = {
     "kitti00": Demo(
         summary="a real car, KITTI 00: IMU, and GPS every ten seconds",
         record=_kitti00,
         graph="gnss_inertial",
         judge=_against_unused_positions,
+        params=_inertial_params,
     ),
     "corridor": Demo(
         summary="a simulated LiDAR in a loop of corridors",
@@ -116,7 +127,7 @@ def demo(
     request = Request(
         graph=chosen.graph,
         recording=recording,
-        params={"map": str(map_folder)},
+        params={"map": str(map_folder)} | chosen.params(recording),
         sets=["store.on_existing=replace"],  # a demo may be run again
     )
     plan = plan_request(request).plan

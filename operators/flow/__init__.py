@@ -1,1 +1,0 @@
-"""Operators that choose among messages, whatever they say."""
