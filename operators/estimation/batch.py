@@ -8,10 +8,12 @@ from __future__ import annotations
 
 import math
 import time
+from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
 
+from mapstream.operators.estimation.inertial import outdated
 from mapstream.operators.estimation.noise import Factor
 from mapstream.operators.estimation.optimize_config import OptimizeConfig
 from mapstream.operators.estimation.problem import (
@@ -20,7 +22,12 @@ from mapstream.operators.estimation.problem import (
     graph_of,
     make_problem,
 )
-from mapstream.operators.estimation.report import KindReport, OptimizationReport, dropped_edges
+from mapstream.operators.estimation.report import (
+    KindReport,
+    OptimizationReport,
+    as_one,
+    dropped_edges,
+)
 from mapstream.operators.estimation.robust import Descent, RobustSolution
 from mapstream.operators.estimation.solvers import SOLVERS, Limits
 from mapstream.operators.estimation.start import chordal_values
@@ -30,6 +37,8 @@ from mapstream.recordings.maps.tables import BoolArray
 from mapstream.streams.errors import EstimationError
 
 __all__ = ["OptimizationReport", "OptimizeConfig", "optimize_map"]
+
+_MOST_INTEGRATIONS = 4  # of IMU samples, as long as the biases move
 
 
 def optimize_map(map_: Map, config: OptimizeConfig | None = None) -> tuple[Map, OptimizationReport]:
@@ -43,12 +52,26 @@ def optimize_map(map_: Map, config: OptimizeConfig | None = None) -> tuple[Map, 
     """
     config = config or OptimizeConfig()
     started = time.perf_counter()
+    result, report, plain = _round(map_, config, started)
+    for _ in range(_MOST_INTEGRATIONS - 1):
+        if not outdated(result, plain):
+            break
+        before = report
+        result, report, plain = _round(result, config, started)
+        report = as_one(before, report)
+    return result, report
+
+
+def _round(
+    map_: Map, config: OptimizeConfig, started: float
+) -> tuple[Map, OptimizationReport, Mapping[int, Factor]]:
+    """Return the solution for IMU samples integrated with the biases of now, a report, and its factors."""
     problem = make_problem(map_, config)
     try:
         best = _solve(problem, config, started)
     except RuntimeError as error:
         raise EstimationError(describe_failure(error, map_)) from error
-    return _result(problem, best), _report(problem, best, config, started)
+    return _result(problem, best), _report(problem, best, config, started), problem.plain
 
 
 def _solve(problem: Problem, config: OptimizeConfig, started: float) -> RobustSolution:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -119,3 +119,14 @@ def score_loops(map_: Map, is_false: BoolArray) -> LoopScore:
         num_false_kept=num_kept - true_kept,
         num_true_dropped=num_true - true_kept,
     )
+
+
+def as_one(first: OptimizationReport, second: OptimizationReport) -> OptimizationReport:
+    """Return the report of two optimisations, of which the second went on where the first ended."""
+    kinds = {
+        name: replace(kind, chi2_before=first.kinds[name].chi2_before)
+        for name, kind in second.kinds.items()
+    }
+    iterations = first.iterations + second.iterations
+    error_before = first.error_before
+    return replace(second, error_before=error_before, iterations=iterations, kinds=kinds)

@@ -12,6 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from mapstream.operators.estimation.batch import optimize_map
 from mapstream.operators.estimation.fixing import fixed_keys
 from mapstream.operators.estimation.inertial import Bias, Samples, outdated, preintegrated
 from mapstream.operators.estimation.kinds import make_factors
@@ -239,6 +240,25 @@ def test_F2_biases_that_moved_ask_for_a_new_integration() -> None:
     values = initial_values(solved.map, solved.values.keys())
     before, after = (sum(f[row].error(values) for row in stale) for f in (factors, again))
     assert after != pytest.approx(before, rel=1e-9)
+
+
+def test_F2_optimisation_integrates_anew_until_the_biases_rest() -> None:
+    """Nothing is left to gain from the samples once more, though the search began without biases."""
+    map_, truth = flown()
+    map_ = disturbed(map_, np.random.default_rng(1), 0.02, 0.05)
+
+    optimised, report = optimize_map(map_)
+    again, second = optimize_map(optimised)
+
+    assert outdated(optimised, factors_of(optimised)) == []
+    assert report.error_before > 100
+    assert second.error_before < report.error_after + 1e-3  # the data are exact
+    assert report.error_after < 1e-2
+    np.testing.assert_allclose(
+        again.vertices.gyro_bias_radps, optimised.vertices.gyro_bias_radps, atol=1e-5
+    )
+    np.testing.assert_allclose(optimised.vertices.gyro_bias_radps - BIAS.gyro_radps, 0, atol=1e-3)
+    assert position_errors_m(optimised, truth).max() < 0.01
 
 
 def test_A10_biases_from_the_odometry_are_where_the_search_begins() -> None:
