@@ -50,7 +50,12 @@ def with_solution(map_: Map, values: Values, held: Collection[int] = ()) -> Map:
     map_ = _with_poses(map_, moved.get("pose", nothing), values)
     map_ = _with_velocities(map_, moved.get("velocity", nothing), values)
     map_ = _with_biases(map_, moved.get("bias", nothing), values)
-    map_ = with_landmarks(map_, before, moved.get("landmark", nothing), values)
+    landmarks = present.get("landmark", nothing)
+    if held:  # a landmark that stays where it is moves in the base of a vertex that does not
+        vertices = map_.landmarks.vertex[landmarks]
+        is_carried = (map_.T_map_base(vertices) != before.T_map_base(vertices)).any(axis=(1, 2))
+        landmarks = landmarks[is_carried | np.isin(landmarks, moved.get("landmark", nothing))]
+    map_ = with_landmarks(map_, before, landmarks, values)
     map_ = _with_frames(map_, moved.get("frame", nothing), values)
     places = {
         row: values.atPose3(key_of("extrinsics", row)).matrix()
