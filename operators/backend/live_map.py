@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -12,17 +11,29 @@ from mapstream.operators.estimation.batch import (
     OptimizeConfig,
     optimize_map,
 )
-from mapstream.operators.estimation.fixing import fixed
+from mapstream.operators.estimation.first_fixes import FirstFixes, headed, is_linked
+from mapstream.operators.estimation.gauge import gauge_factors
 from mapstream.operators.estimation.incremental import IncrementalProblem
+from mapstream.operators.estimation.inertial import outdated
+from mapstream.operators.estimation.inertial_start import (
+    dead_reckoned,
+    first_velocity_prior,
+    with_known_biases,
+)
 from mapstream.operators.estimation.kinds import make_factors
 from mapstream.operators.estimation.noise import Factor, NoiseModels
+from mapstream.operators.estimation.priors import prior_factors
+from mapstream.operators.estimation.problem import with_loss
+from mapstream.operators.estimation.states import initial_values, with_solution
 from mapstream.operators.estimation.symbols import PoseSymbols
 from mapstream.recordings.maps.build import add_edges, anchored
 from mapstream.recordings.maps.model import Map
+from mapstream.recordings.maps.order import in_canonical_order
 from mapstream.recordings.maps.submaps import append_submap
 from mapstream.streams.errors import EstimationError
-from mapstream.streams.geometry import SE3, invert
+from mapstream.streams.geometry import SE3
 from mapstream.streams.messages.estimates import MapCorrection, RelativePose, Submap
+from mapstream.streams.messages.sensors import IntArray
 
 _CONSISTENT_CHI2 = 16.8  # per loop: 99 % of a chi2 with six degrees of freedom
 
@@ -30,6 +41,8 @@ _CONSISTENT_CHI2 = 16.8  # per loop: 99 % of a chi2 with six degrees of freedom
 class LiveMap:
     """The map, and the incremental problem behind it; symbols of poses are rows of vertices.
 
+    Rows stay where they are while it grows, so vertices that came late lie behind newer ones; `ordered` is
+    the map as it goes out.
     Loops enter as plain factors, since a robust cost would throw out a true loop that contradicts drift.
     When the loops contradict each other or the rest, the batch solver says which are false, and their
     factors leave the problem; they stay in the map with the switch that they got.
@@ -43,29 +56,30 @@ class LiveMap:
         self._problem = IncrementalProblem()
         self._symbols = PoseSymbols()
         self._noise_of = NoiseModels()
+        self._seen: set[bytes] = set()  # ids of edges that are in the problem, or were found false
+        self._fixes = FirstFixes(8 if "position" in config.losses else 4)
         self._newest: dict[str, SE3] = {}  # mission -> T_odom_base of its newest vertex
 
+    def ordered(self) -> Map:
+        """Return the map with its rows in the canonical order."""
+        return in_canonical_order(self.map)
+
     def append(self, submap: Submap, *, mission_name: str = "") -> None:
-        """Add a submap's vertices and edges, and solve.
+        """Add a submap's vertices, edges and measurements, take out the edges that it splits, and solve.
 
         Raises:
             MapError: If it is not the next one of its mission.
             EstimationError: If its edges do not determine its poses.
         """
-        num_vertices, num_edges = len(self.map.vertices), len(self.map.edges)
+        num_vertices = len(self.map.vertices)
         self.map = append_submap(self.map, submap, mission_name=mission_name)
         if num_vertices == 0:
             self.map = anchored(self.map, 0, self._T_map_first)
-        for keyframe in submap.keyframes:
+        for keyframe in [*(splice.keyframe for splice in submap.splices), *submap.keyframes]:
             self._symbols.pose_at(submap.mission_id, keyframe.stamp_ns)
         self._require_rows_are_symbols()
-        poses = self.map.T_map_base(np.arange(num_vertices, len(self.map.vertices)))
-        factors = self._factors(num_edges)
-        if submap.index == 0:  # a new mission: nothing ties it to the others yet
-            factors[_hold(num_vertices)] = fixed(num_vertices, poses[0])
-        self._problem.update(poses=poses, add=factors)
+        self._solve_with(np.arange(num_vertices, len(self.map.vertices)))
         self._newest[submap.mission_id] = submap.keyframes[-1].odometry.T_odom_base
-        self._take_poses()
 
     def close_loops(self, edges: Sequence[RelativePose]) -> None:
         """Add loops between vertices of the map, and solve; false ones are switched off.
@@ -75,23 +89,21 @@ class LiveMap:
         """
         if not edges:
             return
-        num_edges = len(self.map.edges)
-        self.map = add_edges(self.map, edges)
-        factors = self._factors(num_edges)
         before = self._problem.chi2()
-        self._problem.update(poses=np.zeros((0, 4, 4)), add=factors)
+        self.map = add_edges(self.map, edges)
+        self._solve_with(np.empty(0, dtype=np.int64))
         self._problem.settle()
-        self._take_poses()
+        self._take()
         if self._problem.chi2() - before > _CONSISTENT_CHI2 * len(edges):
             self._settle_contradiction()
 
     def finish(self) -> OptimizationReport:
-        """Optimise the whole map in one batch; its poses and switches are the final ones.
+        """Optimise the whole map in one batch; its states and switches are the final ones.
 
         Raises:
             EstimationError: If the map has no finite solution.
         """
-        self.map, report = optimize_map(self.map, self._config)
+        self.map, report = optimize_map(self.ordered(), self._config)
         return report
 
     def correction(self, mission_id: str) -> MapCorrection:
@@ -114,31 +126,94 @@ class LiveMap:
             counts = f"{len(self._symbols)} symbols, {len(self.map.vertices)} vertices"
             raise EstimationError(f"two keyframes of one mission share a stamp: {counts}")
 
-    def _factors(self, first_edge: int) -> dict[int, Factor]:
-        rows = range(first_edge, len(self.map.edges))
-        return make_factors(self.map, rows, self._noise_of)
+    def _names(self) -> dict[bytes, int]:
+        """Return the row of each edge by the name of its factor, which is the edge's id."""
+        return {row.tobytes(): at for at, row in enumerate(self.map.edges.id)}
 
-    def _take_poses(self) -> None:
-        T_mission_map = invert(self.map.missions.T_map_mission)
-        poses = T_mission_map[self.map.vertices.mission] @ self._problem.poses()
-        self.map = replace(self.map, vertices=replace(self.map.vertices, T_mission_base=poses))
+    def _solve_with(self, new_vertices: IntArray) -> None:
+        """Bring the problem to the edges of the map, and take its solution."""
+        rows = self._names()
+        gone = self._seen - rows.keys()
+        self._seen -= gone
+        self.map = with_known_biases(self.map, new_vertices)
+        meeting = [f for f in self._fixes.meet(self.map) if not is_linked(self.map, f)]
+        fresh = {name: row for name, row in rows.items() if name not in self._seen}
+        waiting = self._fixes.waiting(self.map, fresh.values())
+        named = self._made([row for row in fresh.values() if row not in waiting])
+        self._seen |= named.keys()
+        inertial = {rows[n]: f for n, f in named.items() if self.map.edges.kind[rows[n]] == "imu"}
+        self.map = dead_reckoned(self.map, inertial, new_vertices)
+        if meeting:
+            for fixes in meeting:
+                self.map = headed(self.map, fixes, self._softened)
+            self._start_anew()
+            return
+        added = named | self._holds({rows[n]: f for n, f in named.items()}, new_vertices)
+        values = initial_values(self.map, self._problem.new_keys(added.values()))
+        self._problem.update(values, added, gone & self._problem.names)
+        self._take()
+        self._integrate_anew(rows)
+
+    def _made(self, rows: Sequence[int]) -> dict[bytes, Factor]:
+        """Return a factor by name for each of these edges whose kind is known."""
+        factors = make_factors(self.map, rows, self._noise_of)
+        return {
+            self.map.edges.id[row].tobytes(): self._softened(row, factor)
+            for row, factor in factors.items()
+        }
+
+    def _softened(self, row: int, factor: Factor, widening: float = 1.0) -> Factor:
+        loss = self._config.losses.get(self.map.edges.kind[row])
+        if loss is None:
+            return factor
+        return with_loss(factor, loss, widening * self._config.loss_width)
+
+    def _holds(self, factors: dict[int, Factor], new_vertices: IntArray) -> dict[bytes, Factor]:
+        """Return what holds missions that begin here, and weak priors on new variables of other kinds."""
+        missions = np.unique(self.map.vertices.mission[new_vertices]).tolist()
+        begun = [m for m in missions if self.map.mission_id(m) not in self._newest]
+        firsts = {int(self.map.vertices_of(mission)[0]) for mission in begun}
+        holds = gauge_factors(self.map, factors) if firsts else []
+        holds = [factor for factor in holds if factor.keys()[0] in firsts]
+        holds += [first_velocity_prior(self.map, v) for v in firsts & self._inertial_vertices()]
+        new_keys = self._problem.new_keys(factors.values())
+        priors = prior_factors(self.map, factors).items()
+        holds += [factor for key, factor in priors if key in new_keys]
+        return {b"hold%d" % factor.keys()[0]: factor for factor in holds}
+
+    def _inertial_vertices(self) -> set[int]:
+        return set(self.map.edges.vertex_a[self.map.edges_of("imu")].tolist())
+
+    def _integrate_anew(self, rows: Mapping[bytes, int]) -> None:
+        """Replace IMU factors whose bias has moved too far since their samples were integrated."""
+        inertial = {rows[n]: f for n, f in self._problem.factors.items() if n in rows}
+        stale = outdated(self.map, inertial)
+        if stale:
+            named = self._made(stale)
+            self._problem.update(initial_values(self.map, []), named, list(named))
+            self._take()
+
+    def _take(self) -> None:
+        self.map = with_solution(self.map, self._problem.values())
 
     def _settle_contradiction(self) -> None:
         """Ask the batch solver which loops are false, and go on without their factors."""
         self.num_contradictions += 1
         self.map, _ = optimize_map(self.map, self._config)
+        self._start_anew()
+
+    def _start_anew(self) -> None:
+        """Begin the problem again with the map as it is, less edges that were switched off."""
         edges = self.map.edges
-        is_true = ~edges.is_switchable | (edges.switch >= 0.5)
-        rows = np.flatnonzero(is_true).tolist()
-        factors = make_factors(self.map, rows, self._noise_of)
-        poses = self.map.T_map_base(np.arange(len(self.map.vertices)))
-        for row in range(len(self.map.missions)):
-            first = int(self.map.vertices_of(row)[0])
-            factors[_hold(first)] = fixed(first, poses[first])
-        self._problem.reset(poses, factors)
-        self._take_poses()
-
-
-def _hold(vertex: int) -> int:
-    """Return the number of the factor that holds a vertex; those of edges are their rows, from 0."""
-    return -1 - vertex
+        is_on = ~edges.is_switchable | (edges.switch >= 0.5)
+        rows = [at for at, row in enumerate(edges.id) if is_on[at] and row.tobytes() in self._seen]
+        named = self._made(rows)
+        row_of = self._names()
+        factors = {row_of[name]: factor for name, factor in named.items()}
+        holds = [*gauge_factors(self.map, factors), *prior_factors(self.map, factors).values()]
+        firsts = {int(self.map.vertices_of(m)[0]) for m in range(len(self.map.missions))}
+        holds += [first_velocity_prior(self.map, v) for v in firsts & self._inertial_vertices()]
+        named |= {b"hold%d" % factor.keys()[0]: factor for factor in holds}
+        keys = {key for factor in named.values() for key in factor.keys()}  # noqa: SIM118  # gtsam's
+        self._problem.reset(initial_values(self.map, keys), named)
+        self._take()

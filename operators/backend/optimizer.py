@@ -70,14 +70,14 @@ class Optimizer(Operator[Inputs, Outputs]):
             await outputs.corrections.send(self._live.correction(submap.mission_id))
             num_submaps += 1
             if every and num_submaps % every == 0:
-                await outputs.maps.send(self._live.map)
+                await outputs.maps.send(self._live.ordered())
         if not num_submaps:
             warn("no submap came, so there is no map")
             return
         report = await offload(self._live.finish)
         for row in report.switched_off:
             warn(f"loop closure {row} contradicts the rest and was switched off")
-        await outputs.maps.send(self._live.map)
+        await outputs.maps.send(self._live.ordered())
 
     async def _close_loops(self, loops: Receiver[LoopReport], submap: Submap) -> None:
         """Take the report on this submap; reports come in the order of the submaps."""

@@ -1,121 +1,184 @@
-"""The map's problem while it grows: iSAM2 (Kaess et al., IJRR 2012), factors added and removed by number.
+"""The map's problem while it grows: iSAM2 (Kaess et al., IJRR 2012), factors added and removed by name.
 
-All poses stay in the problem (square root smoothing), so that a loop moves the whole past.
+All variables stay in the problem (square root smoothing), so that a loop moves the whole past.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import gtsam
 import numpy as np
 
+from mapstream.operators.estimation.keys import rows_by_variable
 from mapstream.operators.estimation.noise import Factor
-from mapstream.operators.estimation.states import poses_from, values_from
+from mapstream.operators.estimation.states import Values
 from mapstream.streams.errors import EstimationError
-from mapstream.streams.messages.sensors import FloatArray
+
+Name = bytes  # of a factor; the caller chooses it
+_WEAK_SIGMA = 1e3  # [rad, m, m/s]: what holds a variable that nothing determines
 
 
 class IncrementalProblem:
-    """Poses under the keys 0, 1, 2 ... and factors under numbers of the caller's choice.
+    """Variables of any kind under the keys of `keys.py`, and factors under names of the caller's choice.
 
-    iSAM2 with Cholesky fails on long chains of weak edges; then the problem is solved as a whole and
-    iSAM2 starts anew from there, which `num_rebuilds` counts.
+    Where iSAM2 finds the problem indeterminate, as its Cholesky does on long chains of weak edges, it is
+    solved as a whole and iSAM2 starts anew from there, which `num_rebuilds` counts; then with QR. Poses that
+    are not determined even so get a weak prior, which `num_weak` counts.
     """
 
     def __init__(self) -> None:
         self.num_rebuilds = 0
-        self._factors: dict[int, Factor] = {}
-        self._indices: dict[int, int] = {}  # of the factors inside iSAM2
-        self._num_poses = 0
-        self._isam = _new_isam()
+        self.num_weak = 0
+        self._factors: dict[Name, Factor] = {}
+        self._indices: dict[Name, int] = {}  # of the factors inside iSAM2
+        self._keys: set[int] = set()
+        self._is_precise = False  # Cholesky was not precise enough
+        self._is_weak = False  # it was indeterminate as a whole, so each new variable gets a prior
+        self._isam = _new_isam(is_precise=False)
 
     def __len__(self) -> int:
-        return self._num_poses
+        return len(self._keys)
+
+    @property
+    def factors(self) -> Mapping[Name, Factor]:
+        """All factors by name, the problem's own weak priors among them."""
+        return self._factors
+
+    @property
+    def names(self) -> set[Name]:
+        """The factors that are in the problem, without its own weak priors."""
+        return {name for name in self._factors if not name.startswith(b"weak")}
+
+    def new_keys(self, factors: Iterable[Factor]) -> set[int]:
+        """Return the variables of these factors that the problem does not have yet."""
+        return {key for factor in factors for key in factor.keys()} - self._keys  # noqa: SIM118  # gtsam's
 
     def update(
-        self,
-        *,
-        poses: FloatArray,
-        add: Mapping[int, Factor],
-        remove: Sequence[int] = (),
+        self, values: Values, add: Mapping[Name, Factor], remove: Iterable[Name] = ()
     ) -> None:
-        """Add poses (N, 4, 4) under the next keys, add and remove factors, and solve.
+        """Add variables with these values, add and remove factors, and solve.
 
         Raises:
-            EstimationError: If the poses are not determined even by the problem as a whole.
+            EstimationError: If the variables are not determined even with weak priors.
         """
-        values = gtsam.Values()
-        for offset, pose in enumerate(poses):
-            values.insert(self._num_poses + offset, gtsam.Pose3(pose))
-        gone = [self._indices.pop(number) for number in remove]
-        for number in remove:
-            del self._factors[number]
-        graph = gtsam.NonlinearFactorGraph()
-        for factor in add.values():
-            graph.add(factor)
-        self._factors.update(add)
-        self._num_poses += len(poses)
+        gone = [self._indices.pop(name) for name in remove]
+        for name in remove:
+            del self._factors[name]
+        added = dict(add)
+        if self._is_weak:
+            added |= self._weak_priors(values, values.keys())
+        self._keys |= set(values.keys())
+        self._factors |= added
         try:
-            result = self._isam.update(graph, values, gone)
+            result = self._isam.update(_graph_of(added.values()), values, gone)
         except RuntimeError:
             self._rebuild(values)
         else:
-            self._indices.update(zip(add, result.getNewFactorsIndices(), strict=True))
+            self._indices.update(zip(added, result.getNewFactorsIndices(), strict=True))
 
     def settle(self, tolerance_m: float = 1e-5, most: int = 20) -> None:
         """Go on until no pose moves further than the tolerance: a loop takes several steps to sink in."""
-        old = self.poses()
+        old = self._positions()
         for _ in range(most):
             self._isam.update()
-            new = self.poses()
+            new = self._positions()
             if np.abs(new - old).max(initial=0.0) < tolerance_m:
                 return
             old = new
 
-    def poses(self) -> FloatArray:
-        """Return all poses (N, 4, 4) by key."""
-        if not self._num_poses:
-            return np.zeros((0, 4, 4))
-        return poses_from(self._isam.calculateEstimate(), self._num_poses)
+    def values(self) -> Values:
+        """Return the present estimate of all variables."""
+        return self._isam.calculateEstimate()
 
     def chi2(self) -> float:
         """Return the squared weighted error of all factors at the present estimate."""
-        values = self._isam.calculateEstimate()
+        values = self.values()
         return 2 * sum(float(factor.error(values)) for factor in self._factors.values())
 
-    def reset(self, poses: FloatArray, factors: Mapping[int, Factor]) -> None:
-        """Start anew with poses (N, 4, 4) and factors, for instance after a batch optimisation."""
-        self._factors, self._num_poses = dict(factors), len(poses)
-        self._start(values_from(poses))
+    def reset(self, values: Values, factors: Mapping[Name, Factor]) -> None:
+        """Start anew with values and factors, for instance after a batch optimisation.
 
-    def _graph(self) -> Any:  # noqa: ANN401
-        graph = gtsam.NonlinearFactorGraph()
-        for factor in self._factors.values():
-            graph.add(factor)
-        return graph
+        Raises:
+            EstimationError: If the variables are not determined.
+        """
+        self._factors, self._keys = dict(factors), set(values.keys())
+        if self._is_weak:
+            self._factors |= self._weak_priors(values, values.keys())
+        try:
+            self._start(values)
+        except RuntimeError:
+            self._rebuild(values)
 
-    def _start(self, values: Any) -> None:  # noqa: ANN401
-        self._isam = _new_isam()
-        result = self._isam.update(self._graph(), values)
+    def _positions(self) -> Any:  # noqa: ANN401  # (N, 12) of all poses
+        return gtsam.utilities.extractPose3(self.values())
+
+    def _start(self, values: Values) -> None:
+        isam = _new_isam(is_precise=self._is_precise)
+        result = isam.update(_graph_of(self._factors.values()), values)
         self._indices = dict(zip(self._factors, result.getNewFactorsIndices(), strict=True))
+        self._isam = isam
 
-    def _rebuild(self, added: Any) -> None:  # noqa: ANN401
-        """Solve the whole, from where iSAM2 stood when it failed."""
+    def _rebuild(self, added: Values) -> None:
+        """Solve the whole, from where iSAM2 stood when it failed; with weak priors if it must be."""
         self.num_rebuilds += 1
         start = gtsam.Values(self._isam.getLinearizationPoint())
-        for key in added.keys():  # noqa: SIM118  # gtsam's values are no mapping
-            if not start.exists(key):
-                start.insert(key, added.atPose3(key))
-        try:
-            self._start(gtsam.LevenbergMarquardtOptimizer(self._graph(), start).optimize())
-        except RuntimeError as error:
-            raise EstimationError(f"the poses are not determined: {str(error).strip()}") from error
+        for key in start.keys():  # noqa: SIM118  # gtsam's values are no mapping
+            if key not in self._keys or added.exists(key):
+                start.erase(key)
+        start.insert(added)
+        reason = ""
+        for remedy in (self._as_it_is, self._precisely, self._weakly):
+            remedy(start)
+            try:
+                self._solve_and_start(start)
+            except RuntimeError as error:
+                reason = str(error).strip()
+            else:
+                return
+        raise EstimationError(f"the problem is not determined: {reason}")
+
+    def _as_it_is(self, start: Values) -> None:
+        """From a better linearisation point it may be determined."""
+
+    def _precisely(self, start: Values) -> None:  # noqa: ARG002  # as the other remedies
+        """QR keeps twice as many digits as Cholesky, which weak and strong edges together need."""
+        self._is_precise = True
+
+    def _weakly(self, start: Values) -> None:
+        self._is_weak = True
+        self._factors |= self._weak_priors(start, self._keys)
+
+    def _solve_and_start(self, start: Values) -> None:
+        params = gtsam.LevenbergMarquardtParams()
+        if self._is_precise:
+            params.setLinearSolverType("MULTIFRONTAL_QR")
+        graph = _graph_of(self._factors.values())
+        self._start(gtsam.LevenbergMarquardtOptimizer(graph, start, params).optimize())
+
+    def _weak_priors(self, values: Values, keys: Iterable[int]) -> dict[Name, Factor]:
+        """Return a prior on each of the variables, where it is, too weak to matter where anything else speaks."""
+        rows = rows_by_variable(keys)
+        poses = rows.get("pose", np.zeros(0, np.int64)).tolist()
+        noise = gtsam.noiseModel.Isotropic.Sigma(6, _WEAK_SIGMA)
+        self.num_weak += len(poses)
+        return {
+            b"weak%d" % key: gtsam.PriorFactorPose3(key, values.atPose3(key), noise)
+            for key in poses
+        }
 
 
-def _new_isam() -> Any:  # noqa: ANN401
+def _graph_of(factors: Iterable[Factor]) -> Any:  # noqa: ANN401
+    graph = gtsam.NonlinearFactorGraph()
+    for factor in factors:
+        graph.add(factor)
+    return graph
+
+
+def _new_isam(*, is_precise: bool) -> Any:  # noqa: ANN401
     params = gtsam.ISAM2Params()
+    params.setFactorization("QR" if is_precise else "CHOLESKY")
     params.setRelinearizeThreshold(0.01)
     params.relinearizeSkip = 1
     return gtsam.ISAM2(params)
