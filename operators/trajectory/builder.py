@@ -58,6 +58,7 @@ class TrajectoryBuilder:
         self._late: dict[int, list[Constraint]] = {}  # by stamp, not newer than the newest pose
         self._out: list[int] = []  # stamps of poses that went out, of the last while
         self._num_submaps = 0
+        self._ahead_ns = -END  # the stamp up to which the IMU was integrated for predictions
         self._reckoning = DeadReckoning(links.sources, links.imu)
 
     def ask(self, stamp_ns: int) -> None:
@@ -132,7 +133,10 @@ class TrajectoryBuilder:
         if self._links.imu is None or not self._links.imu.measures(newest_ns, stamp_ns):
             reason = f"no source of motion reaches from the pose at {newest_ns} ns"
             raise EstimationError(f"nothing is known of {stamp_ns} ns: {reason}")
-        return self._reckoning.reached(newest_ns, stamp_ns, None)
+        if newest_ns < self._ahead_ns < stamp_ns:  # go on from there: integrating all again takes long
+            newest_ns = self._ahead_ns
+        self._ahead_ns = stamp_ns
+        return self._reckoning.go_on(newest_ns, stamp_ns, None)
 
     def _reach(self, stamp_ns: int) -> list[RelativePose]:
         """Go on to a new pose; return the edges that lead to it."""

@@ -81,6 +81,13 @@ class ImuConfig(OperatorConfig):
         return {**self.model_dump(exclude={"max_gap_s"}), "T_base_sensor": place}
 
 
+class ConstraintsConfig(OperatorConfig):
+    """An input that gets `Constraint`."""
+
+    period_s: NonNegativeFloat = 0.0
+    """At most one measurement in so long is used; 0: all are."""
+
+
 SourceConfig = Annotated[OdometryConfig | WheelConfig | StillConfig, Field(discriminator="kind")]
 
 
@@ -91,8 +98,8 @@ class TrajectoryConfig(OperatorConfig):
     """Sources of motion by name; the first that knows an interval gives the first guess."""
     imu: ImuConfig | None = None
     """With an IMU: an input `imu`, and its noise."""
-    constraints: tuple[str, ...] = ()
-    """Names of inputs of measurements on poses."""
+    constraints: dict[str, ConstraintsConfig] = Field(default_factory=dict)
+    """Inputs of measurements on poses, by name."""
     clouds: bool = False
     """An input `clouds`: poses are made where clouds are, and keep them."""
     bridge: Literal["none", "still", "constant_velocity"] = "still"

@@ -116,14 +116,16 @@ class ImuSource:
         samples = self.samples(start_ns, end_ns)
         R_base_imu = samples.T_base_sensor.R
         times_ns = np.clip(samples.stamps_ns, start_ns, end_ns)
+        steps_s = np.diff(times_ns) / 1e9
+        turns = samples.gyro_radps[1:] @ R_base_imu.T * steps_s[:, None]
+        whole, half = so3_exp(turns), so3_exp(turns / 2)
+        forces = (samples.accel_mps2[1:] + samples.accel_mps2[:-1]) / 2 @ R_base_imu.T
         R, t, v = state.T_odom_base.R, state.T_odom_base.t, state.velocity_mps
-        for k, dt in enumerate(np.diff(times_ns) / 1e9):
-            half = R @ so3_exp(R_base_imu @ samples.gyro_radps[k + 1] * dt / 2)
-            force = R_base_imu @ (samples.accel_mps2[k] + samples.accel_mps2[k + 1]) / 2
-            acceleration = half @ force + self._gravity
+        for k, dt in enumerate(steps_s.tolist()):
+            acceleration = R @ (half[k] @ forces[k]) + self._gravity
             t = t + v * dt + acceleration * dt**2 / 2
             v = v + acceleration * dt
-            R = R @ so3_exp(R_base_imu @ samples.gyro_radps[k + 1] * dt)
+            R = R @ whole[k]
         return InertialState(SE3.from_rotation(R, t), v)
 
 

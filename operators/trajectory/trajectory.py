@@ -68,6 +68,7 @@ class Trajectory(DynamicPorts, Operator[Ports, Outputs]):
         self._trigger = _Trigger(config)
         self._builder: TrajectoryBuilder | None = None
         self._now_ns = -END
+        self._used_ns: dict[str, int] = {}  # by input of measurements: the newest that was used
         self._begun_ns: int | None = None  # the stamp at which the next submap begins
 
     @classmethod
@@ -93,7 +94,7 @@ class Trajectory(DynamicPorts, Operator[Ports, Outputs]):
         names = list(held_back)
         async with anyio.create_task_group() as tasks:
             for name in inputs.keys() - held_back.keys():
-                tasks.start_soon(self._take_as_they_come, inputs[name])
+                tasks.start_soon(self._take_as_they_come, name, inputs[name])
             async for port, message in merge(*held_back.values(), keeps_late=True):
                 self._begin(message.stamp_ns, held_back[names[port]].epoch)
                 self.hear(names[port], message)
@@ -109,10 +110,10 @@ class Trajectory(DynamicPorts, Operator[Ports, Outputs]):
             for _ in range(count):
                 report_loss(reason)
 
-    async def _take_as_they_come(self, constraints: Receiver[Constraint]) -> None:
+    async def _take_as_they_come(self, port: str, constraints: Receiver[Constraint]) -> None:
         async for constraint in constraints:
             self._begin(constraint.stamp_ns, constraints.epoch)
-            self.hear("", constraint)
+            self.hear(port, constraint)
 
     async def _predict(self, predictions: Sender[Odometry], stamp_ns: int) -> None:
         try:
@@ -134,17 +135,27 @@ class Trajectory(DynamicPorts, Operator[Ports, Outputs]):
     def hear(self, port: str, message: Message) -> None:
         """Take one message in."""
         if isinstance(message, Constraint):
-            self.builder.add(message)
+            if self._is_due(port, message.stamp_ns):
+                self.builder.add(message)
         elif isinstance(message, PointCloud):
             self._see(message)
         elif not self._add(port, message):
             report_loss(f"messages of {port} whose stamp does not increase")
             return
-        self._now_ns = max(self._now_ns, message.stamp_ns)
+        if self._config.waits or not isinstance(message, Constraint):
+            self._now_ns = max(self._now_ns, message.stamp_ns)
         if port == self._pace and not isinstance(message, PointCloud):
             pose = getattr(message, "T_odom_base", None)
             if self._trigger.fires(message.stamp_ns, pose):
                 self.builder.ask(message.stamp_ns)
+
+    def _is_due(self, port: str, stamp_ns: int) -> bool:
+        """Return whether enough time passed since the input's last measurement that was used."""
+        period_ns = round(self._config.constraints[port].period_s * _SECOND_NS)
+        if period_ns and stamp_ns < self._used_ns.get(port, -END) + period_ns:
+            return False
+        self._used_ns[port] = stamp_ns
+        return True
 
     def due(self, known_ns: int | None = None) -> list[Submap]:
         """Return the submaps that are full; at the end all that is left."""
