@@ -3,15 +3,21 @@
 from __future__ import annotations
 
 import re
+from pathlib import Path
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from mapstream.graph.load import parse_graph
+from mapstream.graph.plan import plan
+from mapstream.graph.run import run_graph
 from mapstream.operators.operator import Context
 from mapstream.operators.submaps.external_loops import ExternalLoops, ExternalLoopsConfig
 from mapstream.operators.testing import run_operator
+from mapstream.recordings.maps import load_map
+from mapstream.recordings.mcap_writer import McapWriter
 from mapstream.streams.geometry import SE3, so3_exp
 from mapstream.streams.messages.constraints import LoopClosure
 from mapstream.streams.messages.estimates import Keyframe, LoopReport, Odometry, Submap
@@ -166,3 +172,53 @@ async def test_what_another_search_found_stays() -> None:
     (report,), _ = await reports_of([loop(ONE, 0, ONE, 2 * SECOND)], submaps, reports=[other])
 
     assert len(report.edges) == 2
+
+
+GRAPH = """
+version: 1
+name: loops
+params: {recording: {type: path}, map: {type: path}}
+operators:
+  sensors: {use: mcap, config: {path: $recording, topics: {odometry: /odometry, loops: /loops}}}
+  keyframes: {use: keyframes, in: {odometry: sensors.odometry}}
+  submaps: {use: submap_builder, in: {keyframes: keyframes.keyframes}, config: {num_keyframes: 4}}
+  loops:
+    use: external_loops
+    in: {loops: sensors.loops, submaps: submaps.submaps}
+    config: {robots: {husky: ""}}
+  optimizer: {use: optimizer, in: {submaps: submaps.submaps, loops: loops.loops}, run: inline}
+  store: {use: map_store, in: {maps: optimizer.maps}, config: {path: $map}, run: inline}
+"""
+
+
+async def test_A15_a_recorded_loop_closes_a_drive_in_a_graph(tmp_path: Path) -> None:
+    """A robot goes 5 m and comes back, but its odometry says that it is 0.1 m short."""
+    ways_m = [*np.arange(0, 5, 0.5), *np.linspace(5, 0.1, 11)]
+    with McapWriter(tmp_path / "drive.mcap") as writer:
+        for i, way_m in enumerate(ways_m):
+            pose = SE3.from_rotation(np.eye(3), [way_m, 0, 0])
+            writer.write("/odometry", Odometry(stamp_ns=SECOND * (i + 1), T_odom_base=pose))
+        back = LoopClosure(
+            robot_a="husky",
+            stamp_a_ns=SECOND,
+            robot_b="husky",
+            stamp_b_ns=SECOND * len(ways_m),
+            T_a_b=SE3.identity(),
+            covariance=np.eye(6) * 1e-6,
+        )
+        writer.write("/loops", back, log_ns=SECOND * len(ways_m) + 1)
+    values = {"recording": str(tmp_path / "drive.mcap"), "map": str(tmp_path / "map")}
+
+    report = await run_graph(plan(parse_graph(GRAPH, params=values)))
+
+    assert report.status == "complete", report.reasons
+    map_ = load_map(tmp_path / "map")
+    (row,) = map_.edges_of("loop")
+    assert map_.vertices.stamp_ns[
+        [map_.edges.vertex_a[row], map_.edges.vertex_b[row]]
+    ].tolist() == [
+        SECOND,
+        SECOND * len(ways_m),
+    ]
+    last = map_.vertices.T_mission_base[map_.edges.vertex_b[row]]
+    np.testing.assert_allclose(last[:3, 3], [0, 0, 0], atol=0.01)
