@@ -13,6 +13,8 @@ from dataclasses import replace
 
 import numpy as np
 
+from mapstream.operators.estimation.absolute_outliers import reject_absolute
+from mapstream.operators.estimation.determinacy import determined
 from mapstream.operators.estimation.inertial import outdated
 from mapstream.operators.estimation.noise import Factor
 from mapstream.operators.estimation.optimize_config import OptimizeConfig
@@ -29,7 +31,8 @@ from mapstream.operators.estimation.report import (
     dropped_edges,
 )
 from mapstream.operators.estimation.robust import Descent, RobustSolution
-from mapstream.operators.estimation.solvers import SOLVERS, Limits
+from mapstream.operators.estimation.solvers import Limits, Solver, dogleg, levenberg_marquardt
+from mapstream.operators.estimation.sparse_solver import sparse_levenberg_marquardt
 from mapstream.operators.estimation.start import chordal_values
 from mapstream.operators.estimation.states import Values, with_solution
 from mapstream.recordings.maps.model import Map
@@ -41,6 +44,13 @@ __all__ = ["OptimizationReport", "OptimizeConfig", "optimize_map"]
 _MOST_INTEGRATIONS = 4  # of IMU samples, as long as the biases move
 
 
+SOLVERS: dict[str, Solver] = {
+    "lm": levenberg_marquardt,
+    "dogleg": dogleg,
+    "sparse": sparse_levenberg_marquardt,
+}
+
+
 def optimize_map(map_: Map, config: OptimizeConfig | None = None) -> tuple[Map, OptimizationReport]:
     """Return the map with the most likely state and switches, and a report.
 
@@ -48,7 +58,8 @@ def optimize_map(map_: Map, config: OptimizeConfig | None = None) -> tuple[Map, 
     measurements in the map's frame say where the part is.
 
     Raises:
-        EstimationError: If the problem has no unique or no finite solution; it names the variables.
+        EstimationError: If the edges do not determine the state, unless priors shall; it names the variables.
+            If they have no finite solution.
     """
     config = config or OptimizeConfig()
     started = time.perf_counter()
@@ -66,12 +77,18 @@ def _round(
     map_: Map, config: OptimizeConfig, started: float
 ) -> tuple[Map, OptimizationReport, Mapping[int, Factor]]:
     """Return the solution for IMU samples integrated with the biases of now, a report, and its factors."""
-    problem = make_problem(map_, config)
+    rejected: list[int] = []
+    if config.reject_absolute:
+        map_, rejection = reject_absolute(map_)
+        rejected = rejection.rejected
+    problem = determined(make_problem(map_, config), config.underconstrained)
     try:
         best = _solve(problem, config, started)
     except RuntimeError as error:
         raise EstimationError(describe_failure(error, map_)) from error
-    return _result(problem, best), _report(problem, best, config, started), problem.plain
+    report = replace(_report(problem, best, config), rejected_absolute=rejected)
+    report = replace(report, seconds=time.perf_counter() - started)
+    return _result(problem, best), report, problem.plain
 
 
 def _solve(problem: Problem, config: OptimizeConfig, started: float) -> RobustSolution:
@@ -115,9 +132,7 @@ def _result(problem: Problem, best: RobustSolution) -> Map:
     return replace(map_, edges=replace(map_.edges, switch=switch, switch_variance=variance))
 
 
-def _report(
-    problem: Problem, best: RobustSolution, config: OptimizeConfig, started: float
-) -> OptimizationReport:
+def _report(problem: Problem, best: RobustSolution, config: OptimizeConfig) -> OptimizationReport:
     rows = np.fromiter(problem.loops, dtype=np.int64)
     true = set(rows[best.is_true].tolist())
     kinds = _kinds(problem, true, best.values)
@@ -129,7 +144,7 @@ def _report(
         error_before=0.5 * sum(kind.chi2_before for kind in kinds.values()),
         error_after=0.5 * sum(kind.chi2_after for kind in kinds.values()),
         iterations=best.iterations,
-        seconds=time.perf_counter() - started,
+        seconds=0.0,
         start=best.start,
         solver=config.solver,
         kinds=kinds,

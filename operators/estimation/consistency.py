@@ -1,4 +1,4 @@
-"""Which loops agree with odometry alone: a first guess at the true ones that needs no optimisation.
+"""Which loops agree with odometry alone, and with each other: a first guess that needs no optimisation.
 
 The chain of odometry between the ends of a loop has a covariance of its own, and a true loop lies within both
 (the odometric consistency of Mangelson et al., ICRA 2018, section V, for all loops at once).
@@ -6,6 +6,7 @@ The chain of odometry between the ends of a loop has a covariance of its own, an
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
@@ -17,40 +18,73 @@ from mapstream.streams.messages.sensors import FloatArray, IntArray
 MOTION_KINDS = ("odometry", "wheel", "registration", "motion_model")
 
 
+@dataclass(frozen=True, slots=True)
+class OdometryChain:
+    """Where odometry alone puts the vertices of each mission.
+
+    A run is a stretch of one mission's vertices that odometry links without a gap; its first is the identity.
+    """
+
+    poses: FloatArray  # (N, 4, 4) in the frame of the run
+    covariance: FloatArray  # (N, 6, 6) of all steps so far, in the frame of the run
+    run: IntArray  # (N,)
+
+    def spread(self, a: IntArray, b: IntArray) -> FloatArray:
+        """Return the covariance (M, 6, 6) of the steps between vertices of one run, in its frame."""
+        sign = np.where(b >= a, 1.0, -1.0)[:, None, None]
+        between: FloatArray = sign * (self.covariance[b] - self.covariance[a])
+        return between
+
+
 def cycle_chi2(map_: Map, loop_rows: IntArray) -> FloatArray:
     """Return the chi2 (N,) of the cycle that each loop closes with odometry; NaN where none links its ends."""
-    edges = map_.edges
-    poses, covariance, run = _chain(map_)
+    edges, chain = map_.edges, odometry_chain(map_)
     a, b = edges.vertex_a[loop_rows], edges.vertex_b[loop_rows]
     chi2 = np.full(len(loop_rows), np.nan)
-    linked = np.flatnonzero((b >= 0) & (run[a] == run[b]) & (run[a] >= 0))
+    linked = np.flatnonzero((a >= 0) & (b >= 0) & (chain.run[a] == chain.run[b]))
     a, b, rows = a[linked], b[linked], loop_rows[linked]
-    spread = np.where((b >= a)[:, None, None], covariance[b] - covariance[a], 0.0)
-    spread += np.where((b < a)[:, None, None], covariance[a] - covariance[b], 0.0)
-    to_b = adjoint(invert(poses[b]))
-    total = to_b @ spread @ np.swapaxes(to_b, 1, 2) + edges.covariance[rows]
-    left = se3_log(invert(edges.T_a_b[rows]) @ invert(poses[a]) @ poses[b])
-    is_open = ~np.isfinite(np.diagonal(total, axis1=1, axis2=2))
-    total = np.where(is_open[:, :, None] | is_open[:, None, :], np.eye(6), total)
-    left = np.where(is_open, 0.0, left)
-    chi2[linked] = np.einsum("ni,ni->n", left, np.linalg.solve(total, left[..., None])[..., 0])
+    total = in_frame(chain.spread(a, b), invert(chain.poses[b])) + edges.covariance[rows]
+    left = se3_log(invert(edges.T_a_b[rows]) @ invert(chain.poses[a]) @ chain.poses[b])
+    chi2[linked] = mahalanobis(left, total)
     return chi2
 
 
+def mahalanobis(left: FloatArray, covariance: FloatArray) -> FloatArray:
+    """Return the chi2 (...) of residuals (..., 6); directions of infinite variance count nothing."""
+    is_open = ~np.isfinite(np.diagonal(covariance, axis1=-2, axis2=-1))
+    crossing = is_open[..., :, None] | is_open[..., None, :]
+    left = np.where(is_open, 0.0, left)
+    weighted = np.linalg.solve(np.where(crossing, np.eye(6), covariance), left[..., None])
+    chi2: FloatArray = np.einsum("...i,...i->...", left, weighted[..., 0])
+    return chi2
+
+
+def chi2_gate(directions: IntArray | int, probability: float) -> FloatArray:
+    """Return what the chi2 of this many directions stays below with a probability."""
+    from scipy.special import gammaincinv  # noqa: PLC0415  # chi2's quantiles, without scipy.stats
+
+    quantiles: FloatArray = 2 * gammaincinv(np.asarray(directions) / 2, probability)
+    return quantiles
+
+
+def in_frame(covariance: FloatArray, T: FloatArray) -> FloatArray:
+    """Return covariances (N, 6, 6) as seen from another frame, by transforms (N, 4, 4) or one (4, 4)."""
+    to = adjoint(T)
+    moved: FloatArray = to @ covariance @ np.swapaxes(to, -1, -2)
+    return moved
+
+
 def adjoint(T: FloatArray) -> FloatArray:
-    """Return the adjoints (N, 6, 6) of transforms (N, 4, 4), rotation first."""
-    result = np.zeros((len(T), 6, 6))
-    R = T[:, :3, :3]
-    result[:, :3, :3] = result[:, 3:, 3:] = R
-    result[:, 3:, :3] = hat(T[:, :3, 3]) @ R
+    """Return the adjoints (..., 6, 6) of transforms (..., 4, 4), rotation first."""
+    result = np.zeros((*T.shape[:-2], 6, 6))
+    R = T[..., :3, :3]
+    result[..., :3, :3] = result[..., 3:, 3:] = R
+    result[..., 3:, :3] = hat(T[..., :3, 3]) @ R
     return result
 
 
-def _chain(map_: Map) -> tuple[FloatArray, FloatArray, IntArray]:
-    """Return poses by odometry (N, 4, 4), their covariance in the first one's frame, and the run they are in.
-
-    A run is a stretch of one mission's vertices that odometry links without a gap.
-    """
+def odometry_chain(map_: Map) -> OdometryChain:
+    """Return where odometry puts the vertices; those of two runs cannot be compared."""
     edges, num = map_.edges, len(map_.vertices)
     poses = np.tile(np.eye(4), (num, 1, 1))
     covariance, run = np.zeros((num, 6, 6)), np.full(num, -1)
@@ -70,7 +104,7 @@ def _chain(map_: Map) -> tuple[FloatArray, FloatArray, IntArray]:
             )
             run[members] = number
             number += 1
-    return poses, covariance, run
+    return OdometryChain(poses, covariance, run)
 
 
 def _runs(rows: list[int]) -> list[tuple[int, int]]:
@@ -86,7 +120,6 @@ def _integrated(steps: FloatArray, covariance: FloatArray) -> tuple[FloatArray, 
     poses[0] = np.eye(4)
     for k, step in enumerate(steps):
         poses[k + 1] = poses[k] @ step
-    to_first = adjoint(poses[1:])
     spread = np.zeros((len(poses), 6, 6))
-    spread[1:] = np.cumsum(to_first @ covariance @ np.swapaxes(to_first, 1, 2), axis=0)
+    spread[1:] = np.cumsum(in_frame(covariance, poses[1:]), axis=0)
     return poses, spread

@@ -49,6 +49,9 @@ class OptimizationReport:
     kinds: dict[str, KindReport] = field(default_factory=dict)
     switched_off: list[int] = field(default_factory=list)  # rows of edges with a switch below 0.5
     dropped: list[DroppedEdge] = field(default_factory=list)  # the same, for people
+    rejected_absolute: list[int] = field(
+        default_factory=list
+    )  # rows that `reject_absolute` dropped
     underconstrained: list[str] = field(default_factory=list)  # variables that a weak prior holds
     is_converged: bool = True  # or the cap on iterations or time was hit
     final_lambda: float = 1e-5  # the damping with which the next run may begin
@@ -68,6 +71,8 @@ class OptimizationReport:
             if edge.mission_b:
                 ends += f" to {edge.mission_b[:8]} {edge.stamp_b_ns} ns"
             yield f"  {edge.kind} in row {edge.row}, {ends}, chi2 {edge.chi2:.3g}"
+        if self.rejected_absolute:
+            yield f"{len(self.rejected_absolute)} absolute measurements contradict the others"
         for name, count in self.ignored.items():
             yield f"ignored: {count} edges of kind {name}"
         for name in self.underconstrained:

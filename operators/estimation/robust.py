@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 import gtsam
 import numpy as np
 
-from mapstream.operators.estimation.consistency import cycle_chi2
+from mapstream.operators.estimation.consistency import chi2_gate, cycle_chi2
 from mapstream.operators.estimation.noise import Factor, switchable
 from mapstream.operators.estimation.problem import Problem, chi2_of, dimensions
 from mapstream.operators.estimation.solvers import Graph, Limits, Solved, Solver
@@ -25,7 +25,8 @@ from mapstream.streams.errors import EstimationError
 from mapstream.streams.messages.sensors import FloatArray
 
 _NEGLIGIBLE = 100.0  # gates: beyond, a loop hardly pulls, and only fills the matrix
-_WIDENINGS = (4.0,)  # of the gate, to let true loops back in that the first solution lost
+_WIDENINGS = (64.0, 16.0, 4.0)  # of the gate: lets true loops back in that the first solution lost
+_NO_BETTER = 1e-6
 _LIKELY = 0.5  # of the loops that agree with odometry; where fewer are true, the start was bad
 _MAX_ROUNDS = 20
 _UNLUCKY = 5.0  # standard deviations of chi2 above its mean that chance explains
@@ -55,7 +56,7 @@ class Descent:
     ) -> None:
         self._problem, self._solver, self._limits = problem, solver, limits
         self._loops: list[Factor] = list(problem.loops.values())
-        self._gate = _gates(problem, probability)
+        self._gate = chi2_gate(dimensions(problem.loops, problem.map), probability)
         self._iterations = 0
         rows = np.fromiter(problem.loops, dtype=np.int64)
         cycle = cycle_chi2(problem.map, rows) if len(rows) else np.zeros(0)
@@ -82,8 +83,9 @@ class Descent:
         best = self._decided(self._softened(values, 1.0), start)
         for widening in _WIDENINGS:
             again = self._decided(self._softened(best.values, widening), start)
-            if again.cost < best.cost:
-                best = again
+            if again.cost >= best.cost * (1 - _NO_BETTER):
+                break
+            best = again
         return best
 
     def is_likely(self, solution: RobustSolution) -> bool:
@@ -99,7 +101,7 @@ class Descent:
         ]
         values, before = start, np.zeros(0, dtype=bool)
         for _ in range(_MAX_ROUNDS):
-            near = self.may_be_true & (self._chi2(values) < _NEGLIGIBLE * width)
+            near = self.may_be_true & (self._chi2(values) < _NEGLIGIBLE * self._gate)
             graph = self._with([softened[k] for k in np.flatnonzero(near).tolist()])
             solved = self._solve(graph, values, _ROUND_ITERATIONS)
             values = solved.values
@@ -158,11 +160,3 @@ class Descent:
 
     def _is_late(self) -> bool:
         return time.perf_counter() > self._limits.end_s
-
-
-def _gates(problem: Problem, probability: float) -> FloatArray:
-    """Return the chi2 (num_loops,) that a true loop stays below with this probability."""
-    from scipy.special import gammaincinv  # noqa: PLC0415  # chi2's quantiles, without scipy.stats
-
-    quantiles: FloatArray = 2 * gammaincinv(dimensions(problem.loops, problem.map) / 2, probability)
-    return quantiles

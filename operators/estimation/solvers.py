@@ -87,6 +87,3 @@ def _iterate(optimizer: Any, limits: Limits) -> Solved:  # noqa: ANN401
 def _lambda_of(optimizer: Any, limits: Limits) -> float:  # noqa: ANN401
     has_lambda = isinstance(optimizer, gtsam.LevenbergMarquardtOptimizer)
     return float(optimizer.lambda_()) if has_lambda else limits.initial_lambda
-
-
-SOLVERS: dict[str, Solver] = {"lm": levenberg_marquardt, "dogleg": dogleg}
