@@ -15,6 +15,7 @@ import pytest
 from mapstream.graph.catalogue import Catalogue
 from mapstream.graph.load import load_graph
 from mapstream.graph.plan import plan
+from tests.command_line import CommandLine
 from tests.installed import look_installed
 
 ROOT = Path(__file__).parent.parent
@@ -55,21 +56,15 @@ def test_commands_on_the_page_succeed(page: Path, tmp_path: Path, installed_exam
     folder.mkdir()
     (folder / "examples").symlink_to(ROOT / "examples")
     environment = {**os.environ, "PYTHONPATH": str(installed_examples), "COLUMNS": "200"}
-    for line in "\n".join(blocks(page, "console")).splitlines():
-        if not line.startswith("$ mapstream "):
-            continue  # output, or an installation that the fixture stands for
-        command, _, remark = line.removeprefix("$ mapstream ").partition("# exits ")
-        done = subprocess.run(
-            [sys.executable, "-m", "mapstream.graph.cli", *shlex.split(command)],
-            cwd=folder,
-            env=environment,
-            capture_output=True,
-            text=True,
-            timeout=300,
-            check=False,
-        )
+    with CommandLine(folder, environment) as command_line:
+        for line in "\n".join(blocks(page, "console")).splitlines():
+            if not line.startswith("$ mapstream "):
+                continue  # output, or an installation that the fixture stands for
+            command, _, remark = line.removeprefix("$ mapstream ").partition("# exits ")
 
-        assert done.returncode == int(remark or 0), f"{line}\n{done.stdout}\n{done.stderr}"
+            ended = command_line.run(shlex.split(command))
+
+            assert ended.code == int(remark or 0), f"{line}\n{ended.output}"
 
 
 @pytest.mark.parametrize("page", pages_with("python"), ids=name_of)

@@ -76,7 +76,7 @@ def merge(
         folder,
         "merge",
         merged,
-        maps=[map_.digest() for map_ in added],
+        maps=[map_.digest()[:16] for map_ in added],
         common_frame=common_frame,
     )
     if json:

@@ -110,10 +110,6 @@ def _guarded(
 
 
 def _tell(folder: Path, report: OptimizationReport) -> None:
-    error = f"error {report.error_before:.6g} -> {report.error_after:.6g}"
-    steps = f"{report.iterations} iterations, {report.seconds:.1f} s"
-    say(f"{in_place(folder)}: {report.num_vertices} vertices, {error}, {steps}")
-    edges = ", ".join(f"{count} {kind}" for kind, count in report.num_edges.items())
-    say(f"edges: {edges}; {len(report.switched_off)} switched off")
-    for kind, count in report.ignored.items():
-        say(f"ignored: {count} edges of kind {kind}")
+    say(f"{in_place(folder)}: {report.num_vertices} vertices")
+    for line in report.lines():
+        say(line)
