@@ -23,6 +23,7 @@ GROUP = "mapstream.operators"
 OperatorType = type[Operator[Any, Any]]
 
 BUILT_IN = {
+    "absolute_poses": "mapstream.operators.absolute.poses:AbsolutePoses",
     "cloud_sink": "mapstream.operators.sinks.cloud:CloudSink",
     "external_loops": "mapstream.operators.submaps.external_loops:ExternalLoops",
     "gicp_odometry": "mapstream.operators.odometry.gicp_odometry:GicpOdometry",

@@ -1,0 +1,1 @@
+"""Poses that something outside of the robot measured."""
