@@ -12,7 +12,7 @@ from mapstream.operators.estimation.batch import OptimizeConfig, optimize_map
 from mapstream.recordings.maps import check_map
 from tests.operators.estimation.fuzz import Traffic, run_traffic
 
-TRAFFIC = Traffic(num_submaps=25, submap=25, num_sources=20, loop_every=10)
+TRAFFIC = Traffic(num_submaps=10, submap=50, num_sources=25, loop_every=8)
 
 
 def run() -> list[Row]:

@@ -40,6 +40,9 @@ CHANGES = {  # command -> a part of what it says
     "optimize": "",
     "relax --mission 0f --loops loops.csv": "",
     "relax --each": "",
+    "reject-outliers": "0 of 0 absolute measurements",
+    "reject-outliers --loops --set gate_probability=0.99": "0 of 0 loops",
+    "align": "0 missions placed",
     "close-loops --from loops.csv": "1 of 1 loops added",
     "loops delete": "0 edges",
     "fix-stationary --set max_distance_m=2": "5 of 5 stretches",
@@ -133,3 +136,14 @@ def test_M4_files_come_along_and_clashes_are_named(mapstream: Terminal, folder: 
 
     assert done.code == 1
     assert f"mission {MISSION} is in two maps, and its " in done.err
+
+
+def test_K10_covariances_of_poses_are_told(mapstream: Terminal, folder: Path) -> None:
+    """Odometry of six vertices: five steps of 0.1 m each."""
+    told = mapstream("map", folder, "covariance", "--json").json
+
+    [pose] = told["poses"]
+    sigma_m = np.sqrt(np.trace(np.array(pose["covariance"])[3:, 3:]) / 3)
+    assert sigma_m == pytest.approx(np.sqrt(5) * 0.1, rel=0.05)
+    out = mapstream("map", folder, "covariance", "--mission", "line", "--stamp-ns", "1000").out
+    assert "0f0f0f0f" in out

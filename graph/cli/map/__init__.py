@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from mapstream.graph.cli.map.certainty import align, covariance, reject_outliers
 from mapstream.graph.cli.map.edit import anchor, edit
 from mapstream.graph.cli.map.files import export_, import_
 from mapstream.graph.cli.map.history import journal, redo, undo
@@ -36,6 +37,9 @@ app.command("import")(import_)
 app.command("export")(export_)
 app.command("optimize")(optimize)
 app.command("relax")(relax)
+app.command("reject-outliers")(reject_outliers)
+app.command("align")(align)
+app.command("covariance")(covariance)
 app.command("close-loops")(close_loops)
 app.add_typer(loops, name="loops")
 app.command("fix-stationary")(fix_stationary)

@@ -10,6 +10,7 @@ import pytest
 from mapstream.operators.estimation.batch import OptimizeConfig, optimize_map
 from mapstream.operators.maps.edit import Disturbance, disturb
 from mapstream.operators.maps.merge import merge
+from mapstream.operators.maps.outliers import reject_loops
 from mapstream.operators.maps.quality import map_quality, require_no_worse
 from mapstream.operators.maps.relax import relax_map, relax_missions
 from mapstream.operators.maps.residuals import chi2, relative_edges
@@ -20,7 +21,7 @@ from mapstream.recordings.maps.submaps import append_submap
 from mapstream.streams.errors import EstimationError
 from mapstream.streams.geometry import SE3, se3_exp
 from tests.operators.estimation import worlds
-from tests.recordings.made_maps import OTHER_MISSION, full_map, line_map
+from tests.recordings.made_maps import MISSION, OTHER_MISSION, full_map, line_map
 
 LAP = 40
 
@@ -134,3 +135,30 @@ def test_L18_the_limits_are_ten_centimetres_and_0_15_rad(
     map_ = replace(map_, vertices=replace(map_.vertices, T_mission_base=poses))
 
     assert fix_stationary(map_)[1].num_standing == stands
+
+
+def test_K9_loops_that_contradict_odometry_are_switched_off_without_solving() -> None:
+    map_, truth = drive()
+    rng = np.random.default_rng(2)
+    looped = add_edges(map_, worlds.loops(truth, rng, lap=LAP))
+    false = [worlds.false_loop(a, a + 30, rng) for a in (3, 14, 25)]
+    ruined = add_edges(looped, false)
+
+    judged, report = reject_loops(ruined)
+
+    assert report.rejected == [len(looped.edges) + n for n in range(3)]
+    assert (report.num_loops, report.num_untouched) == (12, 0)
+    assert np.flatnonzero(judged.edges.switch == 0).tolist() == report.rejected
+    again, _ = reject_loops(judged)
+    assert again.digest() == judged.digest()
+
+
+def test_K9_loops_between_missions_are_not_judged() -> None:
+    both, _ = merge([line_map(4), line_map(4, OTHER_MISSION)])
+    ends = replace(worlds.false_loop(0, 0, np.random.default_rng(0)), mission_b=OTHER_MISSION)
+    ends = replace(ends, mission_a=MISSION, stamp_a_ns=1_000, stamp_b_ns=1_000)
+
+    judged, report = reject_loops(add_edges(both, [ends]))
+
+    assert (report.num_untouched, report.rejected) == (1, [])
+    assert (judged.edges.switch == 1).all()
