@@ -34,10 +34,12 @@ class OptimizeConfig(BaseModel):
     """The kinds of edges that take part; left out, all do."""
     without: tuple[str, ...] = ()
     """Kinds of edges that do not take part."""
+    unanchored: Literal["join", "apart"] = "join"
+    """Whether edges tie missions whose base frame is a guess to those where it is known; apart, they move none."""
     losses: dict[str, Loss] = {}
     """A robust loss by kind of edge, for instance `odometry: huber`; others are squared."""
-    loss_width: PositiveFloat = 3.0
-    """Where losses begin to flatten, in standard deviations."""
+    loss_width: PositiveFloat = 1.0
+    """Where losses begin to flatten, in units of where each usually does."""
     fix: tuple[Fixable, ...] = ()
     """Variables that stay as they are: poses, velocities, biases, landmarks, frames, extrinsics."""
     underconstrained: Literal["error", "prior"] = "error"

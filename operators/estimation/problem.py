@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections import Counter
 from collections.abc import Mapping
@@ -10,6 +11,7 @@ from dataclasses import dataclass
 import gtsam
 import numpy as np
 
+from mapstream.operators.estimation.consistency import chi2_gate
 from mapstream.operators.estimation.fixing import fixed_keys, fixes
 from mapstream.operators.estimation.gauge import gauge_factors
 from mapstream.operators.estimation.keys import variable_of
@@ -20,6 +22,7 @@ from mapstream.operators.estimation.priors import prior_factors
 from mapstream.operators.estimation.solvers import Graph
 from mapstream.operators.estimation.states import Values, initial_values
 from mapstream.recordings.maps.model import Map
+from mapstream.recordings.maps.tables import BoolArray
 from mapstream.streams.messages.sensors import FloatArray, IntArray
 
 _RELATIVE = ("odometry", "wheel", "registration", "motion_model", "loop")  # need no priors
@@ -28,6 +31,14 @@ _LOSSES: dict[Loss, str] = {
     "cauchy": "Cauchy",
     "geman_mcclure": "GemanMcClure",
     "tukey": "Tukey",
+}
+
+
+_USUAL_WIDTHS: dict[Loss, float] = {  # 95 % efficient without outliers (Zhang, IVC 1997, table 1)
+    "huber": 1.345,
+    "cauchy": 2.385,
+    "geman_mcclure": 1.345,
+    "tukey": 4.685,
 }
 
 
@@ -69,6 +80,8 @@ def make_problem(map_: Map, config: OptimizeConfig) -> Problem:
     takes_part = np.isin(edges.kind, list(makers())) & ~np.isin(edges.kind, config.without)
     if config.kinds is not None:
         takes_part &= np.isin(edges.kind, config.kinds)
+    if config.unanchored == "apart":
+        takes_part &= ~_leaves_the_known(map_)
     may_switch = edges.is_switchable & config.is_robust
     is_on = may_switch | (edges.switch > 0)
     factors = make_factors(map_, np.flatnonzero(takes_part & is_on), NoiseModels())
@@ -101,6 +114,15 @@ def make_problem(map_: Map, config: OptimizeConfig) -> Problem:
     )
 
 
+def _leaves_the_known(map_: Map) -> BoolArray:
+    """Return which edges (N,) lie between a mission whose base frame is known and one where it is not."""
+    is_known = map_.missions.is_base_frame_known[map_.vertices.mission]
+    a, b = map_.edges.vertex_a, map_.edges.vertex_b
+    leaves: BoolArray = (a >= 0) & (b >= 0)
+    leaves[leaves] = is_known[a[leaves]] != is_known[b[leaves]]
+    return leaves
+
+
 def graph_of(factors: list[Factor]) -> Graph:
     """Return gtsam's graph of these factors."""
     graph = gtsam.NonlinearFactorGraph()
@@ -117,11 +139,15 @@ def weighted(factor: Factor, weight: float) -> Factor:
 
 
 def with_loss(factor: Factor, loss: Loss, width: float) -> Factor:
-    """Return the factor under a robust loss that flattens beyond this many standard deviations."""
-    estimator = getattr(gtsam.noiseModel.mEstimator, _LOSSES[loss]).Create(width)
-    return factor.cloneWithNewNoiseModel(
-        gtsam.noiseModel.Robust.Create(estimator, factor.noiseModel())
-    )
+    """Return the factor under a robust loss, of its usual width times this one.
+
+    The usual widths are standard deviations of one direction. Several directions together get the width that
+    chance exceeds as rarely.
+    """
+    noise, usual = factor.noiseModel(), _USUAL_WIDTHS[loss]
+    limit = width * float(np.sqrt(chi2_gate(noise.dim(), math.erf(usual / math.sqrt(2)))))
+    estimator = getattr(gtsam.noiseModel.mEstimator, _LOSSES[loss]).Create(limit)
+    return factor.cloneWithNewNoiseModel(gtsam.noiseModel.Robust.Create(estimator, noise))
 
 
 def chi2_of(factors: Mapping[int, Factor], values: Values) -> FloatArray:

@@ -26,6 +26,8 @@ from mapstream.streams.messages.sensors import FloatArray
 
 _NEGLIGIBLE = 100.0  # gates: beyond, a loop hardly pulls, and only fills the matrix
 _WIDENINGS = (64.0, 16.0, 4.0)  # of the gate: lets true loops back in that the first solution lost
+_SECOND_CHANCES = 0.1  # of the loops found true, for as many others that are least false
+_FEW = 10  # loops always get one
 _NO_BETTER = 1e-6
 _LIKELY = 0.5  # of the loops that agree with odometry; where fewer are true, the start was bad
 _MAX_ROUNDS = 20
@@ -80,9 +82,11 @@ class Descent:
 
     def switched(self, values: Values, start: str) -> RobustSolution:
         """Return the minimum with the loops that are true."""
-        best = self._decided(self._softened(values, 1.0), start)
+        best = self._decided(self._softened(values, 1.0, self.may_be_true), start)
         for widening in _WIDENINGS:
-            again = self._decided(self._softened(best.values, widening), start)
+            again = self._decided(
+                self._softened(best.values, widening, self._plausible(best)), start
+            )
             if again.cost >= best.cost * (1 - _NO_BETTER):
                 break
             best = again
@@ -92,8 +96,16 @@ class Descent:
         """Return whether most of the loops that agree with odometry were found true."""
         return int(solution.is_true.sum()) > _LIKELY * int(self.may_be_true.sum())
 
-    def _softened(self, start: Values, widening: float) -> Values:
-        """Return the minimum of the Geman-McClure cost over the loops that agree with odometry."""
+    def _plausible(self, solution: RobustSolution) -> BoolArray:
+        """Return the loops that are true, and some that are least false: each that joins fills the matrix."""
+        excess = np.where(solution.is_true | ~self.may_be_true, np.inf, solution.chi2 / self._gate)
+        count = max(_FEW, int(_SECOND_CHANCES * solution.is_true.sum()))
+        plausible = solution.is_true.copy()
+        plausible[np.argsort(excess, kind="stable")[:count]] = True
+        return plausible & self.may_be_true
+
+    def _softened(self, start: Values, widening: float, candidates: BoolArray) -> Values:
+        """Return the minimum of the Geman-McClure cost over the candidates."""
         width = widening * self._gate
         softened = [
             loop.cloneWithNewNoiseModel(switchable(loop.noiseModel(), phi))
@@ -101,7 +113,7 @@ class Descent:
         ]
         values, before = start, np.zeros(0, dtype=bool)
         for _ in range(_MAX_ROUNDS):
-            near = self.may_be_true & (self._chi2(values) < _NEGLIGIBLE * self._gate)
+            near = candidates & (self._chi2(values) < _NEGLIGIBLE * self._gate)
             graph = self._with([softened[k] for k in np.flatnonzero(near).tolist()])
             solved = self._solve(graph, values, _ROUND_ITERATIONS)
             values = solved.values
