@@ -73,6 +73,27 @@ def finite_states(map_: Map) -> Iterable[Finding]:
     yield from where(lost, "landmarks", "the position is not finite")
 
 
+def quaternions_have_unit_length(map_: Map) -> Iterable[Finding]:
+    """An orientation is a quaternion of length one."""
+    quat = map_.landmarks.quat_base_xyzw
+    length = np.linalg.norm(np.where(np.isfinite(quat), quat, 0.5), axis=1)
+    broken = np.abs(length - 1) > _ROTATION_TOLERANCE
+    yield from where(
+        broken, "landmarks", lambda row: f"the quaternion has length {length[row]:.6g}, not 1"
+    )
+
+
+def origins_lie_on_the_earth(map_: Map) -> Iterable[Finding]:
+    """The latitude and longitude of an outer frame's origin are some of the earth's."""
+    lat, lon = np.nan_to_num(map_.frames.origin_lla[:, :2]).T
+    broken = (np.abs(lat) > 90) | (np.abs(lon) > 180)
+    yield from where(
+        broken,
+        "frames",
+        lambda row: f"no place on earth: latitude {lat[row]}, longitude {lon[row]}",
+    )
+
+
 def finite_imu_samples(map_: Map) -> Iterable[Finding]:
     """IMU samples are finite."""
     broken = ~_is_finite(np.hstack([map_.imu.gyro_radps, map_.imu.accel_mps2]))
@@ -194,6 +215,8 @@ VALUE_RULES: tuple[Rule, ...] = (
     finite_transforms,
     rigid_transforms,
     finite_states,
+    quaternions_have_unit_length,
+    origins_lie_on_the_earth,
     finite_imu_samples,
     finite_covariances,
     symmetric_covariances,
