@@ -115,14 +115,14 @@ def preintegrated(
     knots_ns, gyro, accel = _at_knots(samples, span_ns)
     T_base_sensor = pose_from_numbers(list(parameters.T_base_sensor))
     hit = parameters.is_saturated(samples.gyro_radps, samples.accel_mps2).astype(np.float64)
-    hit = np.interp(knots_ns, samples.stamps_ns, hit) > 0
+    is_hit = np.interp(knots_ns, samples.stamps_ns, hit) > 0
     accel = _at_base(knots_ns, gyro - bias.gyro_radps, accel, T_base_sensor)
     settings = _Settings(parameters, T_base_sensor)
     integral = gtsam.PreintegratedCombinedMeasurementsG(settings.params, bias.constant)
     steps_s = np.diff(knots_ns) / 1e9
     mean_gyro, mean_accel = (gyro[1:] + gyro[:-1]) / 2, (accel[1:] + accel[:-1]) / 2
-    is_hit = hit[1:] | hit[:-1]
-    for step_s, rate, force, saturated in zip(steps_s, mean_gyro, mean_accel, is_hit, strict=True):
+    hits = is_hit[1:] | is_hit[:-1]
+    for step_s, rate, force, saturated in zip(steps_s, mean_gyro, mean_accel, hits, strict=True):
         settings.use(saturated=bool(saturated))
         integral.integrateMeasurement(force, rate, step_s)
     settings.use(saturated=False)

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mapstream.operators.imu.parameters import ImuParameters
+from mapstream.operators.imu.parameters import ImuQuality
 from mapstream.streams.errors import EstimationError
 from mapstream.streams.geometry import so3_exp, so3_log
 from mapstream.streams.messages.sensors import FloatArray, ImuBatch, IntArray
@@ -52,7 +52,7 @@ def estimate_start(
     stamps_ns: IntArray,
     T_frame_base: FloatArray,
     imu: ImuBatch,
-    parameters: ImuParameters,
+    parameters: ImuQuality,
     noise: PoseNoise,
 ) -> ImuStart:
     """Return biases, velocities and the direction of gravity.
@@ -61,7 +61,7 @@ def estimate_start(
         stamps_ns: (N,) increasing, N >= 3, all within the samples.
         T_frame_base: (N, 4, 4) in any frame.
         imu: Samples.
-        parameters: Of the IMU; where it sits is taken from the samples.
+        parameters: Noise of the IMU; where it sits is taken from the samples.
         noise: Of the poses' steps.
 
     Raises:
@@ -111,7 +111,7 @@ def _gyro_bias(
     knots_ns: IntArray,
     first: IntArray,
     gyro: FloatArray,
-    parameters: ImuParameters,
+    parameters: ImuQuality,
     noise: PoseNoise,
 ) -> tuple[FloatArray, float]:
     """Return the bias (3,) by Gauss and Newton on the turns between poses, and its sigma."""
@@ -156,7 +156,7 @@ def _integrated(
 
 
 def _solved(
-    intervals: _Intervals, poses: FloatArray, parameters: ImuParameters, noise: PoseNoise
+    intervals: _Intervals, poses: FloatArray, parameters: ImuQuality, noise: PoseNoise
 ) -> tuple[FloatArray, FloatArray, float]:
     """Return the accelerometer's bias and the velocities in one vector, the direction up, and the bias' sigma."""
     up = _first_up(intervals, poses)
@@ -186,7 +186,7 @@ def _first_up(intervals: _Intervals, poses: FloatArray) -> FloatArray:
 
 
 def _equations(
-    intervals: _Intervals, poses: FloatArray, parameters: ImuParameters, noise: PoseNoise
+    intervals: _Intervals, poses: FloatArray, parameters: ImuQuality, noise: PoseNoise
 ) -> tuple[FloatArray, FloatArray]:
     """Return A and b of A x = b in units of sigma; x is gravity, the accelerometer's bias, the velocities."""
     dt, num = intervals.duration_s, len(poses)

@@ -8,7 +8,7 @@ import numpy as np
 from pydantic import PositiveFloat
 
 from mapstream.operators.imu.bias_estimate import ImuStart, PoseNoise, estimate_start
-from mapstream.operators.imu.parameters import ImuParameters
+from mapstream.operators.imu.parameters import ImuQuality
 from mapstream.operators.imu.samples import cut, is_at_rest, joined, level_attitude
 from mapstream.operators.operator import Operator, OperatorConfig, offload, warn
 from mapstream.streams.channel import Receiver, Sender
@@ -21,8 +21,8 @@ from mapstream.streams.messages.sensors import FloatArray, ImuBatch, IntArray
 class ImuBiasesConfig(OperatorConfig):
     """Options of `imu_biases`."""
 
-    imu: ImuParameters = ImuParameters()
-    """Noise of the IMU; where it sits is taken from its samples."""
+    imu: ImuQuality = ImuQuality()
+    """Its noise and its limits; where it sits is taken from its samples."""
     window_s: PositiveFloat = 5.0
     """How much of the recording is looked at, at least; it is held back so long."""
     max_window_s: PositiveFloat = 30.0

@@ -6,25 +6,27 @@ from collections.abc import Mapping
 from typing import Annotated, Any
 
 import numpy as np
+import numpy.typing as npt
 from pydantic import Field, PositiveFloat
 
 from mapstream.operators.operator import OperatorConfig
 from mapstream.streams.messages.sensors import FloatArray
 from mapstream.streams.sensors import ImuSensor
 
+BoolArray = npt.NDArray[np.bool_]
 _Seven = Annotated[tuple[float, ...], Field(min_length=7, max_length=7)]
 
 
-class ImuParameters(OperatorConfig):
-    """An IMU; without a calibration at hand the defaults are those of a MEMS unit of middling quality."""
+class ImuQuality(OperatorConfig):
+    """How good an IMU is; the defaults are those of a MEMS of middling quality."""
 
     gyro_density: PositiveFloat = 1e-3
     """White noise of the gyroscope [rad/s/sqrt(Hz)]."""
     accel_density: PositiveFloat = 1e-2
     """White noise of the accelerometer [m/s^2/sqrt(Hz)]."""
-    gyro_random_walk: PositiveFloat = 2e-5
+    gyro_random_walk: PositiveFloat = 1e-5
     """Of the gyroscope's bias [rad/s^2/sqrt(Hz)]."""
-    accel_random_walk: PositiveFloat = 1e-3
+    accel_random_walk: PositiveFloat = 1e-4
     """Of the accelerometer's bias [m/s^3/sqrt(Hz)]."""
     gravity_mps2: PositiveFloat = 9.81
     max_gyro_radps: PositiveFloat | None = None
@@ -35,6 +37,19 @@ class ImuParameters(OperatorConfig):
     """How far from zero the bias may begin."""
     accel_bias_sigma_mps2: PositiveFloat = 0.5
     """The same, of the accelerometer."""
+
+    def is_saturated(self, gyro_radps: FloatArray, accel_mps2: FloatArray) -> BoolArray:
+        """Return which samples (N,) reach a limit in some axis of gyro (N, 3) and accel (N, 3)."""
+        gyro_limit = self.max_gyro_radps or np.inf
+        accel_limit = self.max_accel_mps2 or np.inf
+        over_gyro = (np.abs(gyro_radps) >= gyro_limit).any(axis=1)
+        over_accel = (np.abs(accel_mps2) >= accel_limit).any(axis=1)
+        return np.asarray(over_gyro | over_accel)
+
+
+class ImuParameters(ImuQuality):
+    """All that turns samples into factors; a map's mission keeps it among its sensors, under `imu`."""
+
     T_base_sensor: _Seven = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
     """Where it sits: x, y, z [m] and the quaternion x, y, z, w."""
 
@@ -64,10 +79,3 @@ class ImuParameters(OperatorConfig):
     def description(self) -> dict[str, Any]:
         """Return what a mission's sensors hold under "imu"; JSON."""
         return self.model_dump(mode="json", exclude_none=True)
-
-    def is_saturated(self, gyro_radps: FloatArray, accel_mps2: FloatArray) -> Any:  # noqa: ANN401
-        """Return which samples (N,) reach a limit in some axis of gyro (N, 3) and accel (N, 3)."""
-        gyro_limit = self.max_gyro_radps or np.inf
-        accel_limit = self.max_accel_mps2 or np.inf
-        over_gyro = (np.abs(gyro_radps) >= gyro_limit).any(axis=1)
-        return over_gyro | (np.abs(accel_mps2) >= accel_limit).any(axis=1)

@@ -7,6 +7,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt, model_validator
 
+from mapstream.operators.imu.parameters import ImuParameters, ImuQuality
 from mapstream.operators.operator import OperatorConfig
 from mapstream.operators.trajectory.sources import AXES, AxisSigmas
 from mapstream.streams.geometry import SE3
@@ -60,25 +61,17 @@ class StillConfig(AxesConfig):
     kind: Literal["still"]
 
 
-class ImuConfig(OperatorConfig):
-    """Noise of the IMU; the defaults are those of a MEMS of the better kind."""
+class ImuConfig(ImuQuality):
+    """Noise and limits of the IMU, as the map keeps them; where it sits is taken from its samples."""
 
-    gyro_density: PositiveFloat = 1e-3
-    """White noise [rad/s/sqrt(Hz)]."""
-    accel_density: PositiveFloat = 1e-2
-    """White noise [m/s^2/sqrt(Hz)]."""
-    gyro_random_walk: PositiveFloat = 1e-5
-    """Of the bias [rad/s^2/sqrt(Hz)]."""
-    accel_random_walk: PositiveFloat = 1e-4
-    """Of the bias [m/s^3/sqrt(Hz)]."""
-    gravity_mps2: PositiveFloat = 9.81
     max_gap_s: PositiveFloat = 0.2
     """Samples further apart are not integrated."""
 
     def described(self, T_base_sensor: SE3) -> dict[str, object]:
         """Return what a mission's sensor set says of the IMU."""
-        place = [*T_base_sensor.t.tolist(), *T_base_sensor.quat_xyzw.tolist()]
-        return {**self.model_dump(exclude={"max_gap_s"}), "T_base_sensor": place}
+        place = (*T_base_sensor.t.tolist(), *T_base_sensor.quat_xyzw.tolist())
+        quality = self.model_dump(exclude={"max_gap_s"})
+        return ImuParameters(**quality, T_base_sensor=place).description()
 
 
 class ConstraintsConfig(OperatorConfig):
