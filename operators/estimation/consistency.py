@@ -11,11 +11,10 @@ from itertools import pairwise
 
 import numpy as np
 
+from mapstream.recordings.maps.edge_kinds import MOTION_KINDS
 from mapstream.recordings.maps.model import Map
 from mapstream.streams.geometry import hat, invert, se3_log
 from mapstream.streams.messages.sensors import FloatArray, IntArray
-
-MOTION_KINDS = ("odometry", "wheel", "registration", "motion_model")
 
 
 @dataclass(frozen=True, slots=True)

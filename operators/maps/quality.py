@@ -54,6 +54,7 @@ def require_no_worse(before: Map, after: Map) -> None:
         if strain > max(_MOST, _GROWTH * was.get(mission_id, 0.0)):
             raise EstimationError(
                 f"the map got worse and stays as it was: mission {mission_id}'s own motion now contradicts"
-                f" its poses by {strain:.2f} sigma (rms), {was.get(mission_id, 0.0):.2f} before; look for a"
-                " false loop that no solver may switch off, or take the solution all the same (--keep)"
+                f" its poses by {strain:.2f} sigma (rms), {was.get(mission_id, 0.0):.2f} before; let solvers"
+                " switch false loops off (edit switch --kind loop --set is_switchable=true), or take the"
+                " solution all the same (--keep)"
             )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from mapstream.operators.estimation.consistency import mahalanobis
 from mapstream.recordings.maps.edge_kinds import RELATIVE_KINDS
 from mapstream.recordings.maps.model import Map
 from mapstream.streams.geometry import invert, se3_log
@@ -27,17 +28,7 @@ def residuals(map_: Map, rows: IntArray) -> FloatArray:
 
 def chi2(map_: Map, rows: IntArray) -> FloatArray:
     """Return squared residuals (N,) in units of their covariances; what was not measured counts nothing."""
-    covariance, left = map_.edges.covariance[rows], residuals(map_, rows)
-    is_open = np.isinf(np.diagonal(covariance, axis1=1, axis2=2))
-    crossing = is_open[:, :, None] | is_open[:, None, :]
-    closed = np.where(crossing, np.eye(6), covariance)
-    left = np.where(is_open, 0.0, left)
-    try:
-        weighted = np.linalg.solve(closed, left[..., None])[..., 0]
-    except np.linalg.LinAlgError:  # a direction without variance: it cannot be weighed
-        weighted = (np.linalg.pinv(closed, hermitian=True) @ left[..., None])[..., 0]
-    squared: FloatArray = np.einsum("ij,ij->i", left, weighted)
-    return squared
+    return mahalanobis(residuals(map_, rows), map_.edges.covariance[rows])
 
 
 def num_measured(map_: Map, rows: IntArray) -> IntArray:
