@@ -26,6 +26,7 @@ from mapstream.streams.geometry import invert, se3_log
 from mapstream.streams.messages.sensors import FloatArray, IntArray
 
 _SEEDS = 20  # loops with the most agreeing others, from each of which a set is grown
+_WIDENINGS = (1.0, 4.0, 16.0)  # of the gate, for graphs whose covariances promise too much
 
 
 class AlignConfig(BaseModel):
@@ -65,23 +66,29 @@ def align_missions(map_: Map, config: AlignConfig | None = None) -> tuple[Map, A
     Missions whose base frame is known stay. Without one, the first mission is where its frame says.
     """
     config = config or AlignConfig()
-    chain, gate = odometry_chain(map_), float(chi2_gate(6, config.gate_probability))
-    sets = [_largest_set(map_, pair, chain, gate) for pair in _pairs(map_)]
+    pairs, gate = _pairs(map_), float(chi2_gate(6, config.gate_probability))
     is_known = map_.missions.is_base_frame_known.copy()
     is_known[:1] |= not is_known.any()
-    frames, used = map_.missions.T_map_mission.copy(), set[int]()
-    while (number := _strongest(sets, is_known, config.min_loops)) is not None:
-        used.add(number)
-        each = sets[number]
-        if is_known[each.a]:
-            frames[each.b] = frames[each.a] @ each.T_a_b
-        else:
-            frames[each.a] = frames[each.b] @ invert(each.T_a_b)
-        is_known[[each.a, each.b]] = True
-    pairs = [_pair_report(map_, each, number in used) for number, each in enumerate(sets)]
+    frames, used = map_.missions.T_map_mission.copy(), dict[int, _AgreeingLoops]()
+    sets: list[_AgreeingLoops] = []
+    for widening in _WIDENINGS:
+        sets = [_largest_set(pair, widening * gate) for pair in pairs]
+        while (number := _strongest(sets, is_known, config.min_loops)) is not None:
+            each = used[number] = sets[number]
+            if is_known[each.a]:
+                frames[each.b] = frames[each.a] @ each.T_a_b
+            else:
+                frames[each.a] = frames[each.b] @ invert(each.T_a_b)
+            is_known[[each.a, each.b]] = True
+        if is_known.all():
+            break
+    reports = [
+        _pair_report(map_, used.get(number, each), number in used)
+        for number, each in enumerate(sets)
+    ]
     before = map_.missions.is_base_frame_known
     report = AlignmentReport(
-        pairs=pairs,
+        pairs=reports,
         placed=[map_.mission_id(row) for row in np.flatnonzero(is_known & ~before).tolist()],
         left=[map_.mission_id(row) for row in np.flatnonzero(~is_known).tolist()],
     )
@@ -119,33 +126,46 @@ def _strongest(sets: list[_AgreeingLoops], is_known: BoolArray, least: int) -> i
     return best
 
 
-def _pairs(map_: Map) -> list[tuple[int, int, IntArray]]:
-    """Return pairs of missions, and the rows of the edges between them."""
+@dataclass(frozen=True, slots=True)
+class _Pair:
+    """Two missions, and the loops between them."""
+
+    a: int
+    b: int
+    rows: IntArray
+    T_a_b: FloatArray  # (N, 4, 4) between the missions' frames, as each loop means it
+    chi2: FloatArray  # (N, N) of the cycle of every two; infinite where odometry does not link them
+
+
+def _pairs(map_: Map) -> list[_Pair]:
     edges, mission = map_.edges, map_.vertices.mission
+    chain = odometry_chain(map_)
     rows = np.flatnonzero((edges.vertex_a >= 0) & (edges.vertex_b >= 0))
     ends = np.sort(np.column_stack([mission[edges.vertex_a[rows]], mission[edges.vertex_b[rows]]]))
     pairs = []
     for a, b in combinations(range(len(map_.missions)), 2):
         between = rows[(ends == (a, b)).all(axis=1)]
         if len(between):
-            pairs.append((a, b, between))
+            pairs.append(_pair(map_, a, b, between, chain))
     return pairs
 
 
-def _largest_set(
-    map_: Map, pair: tuple[int, int, IntArray], chain: OdometryChain, gate: float
-) -> _AgreeingLoops:
-    """Return the loops between two missions that agree pairwise."""
-    a, b, rows = pair
-    loops = _between(map_, a, rows)
+def _pair(map_: Map, a: int, b: int, rows: IntArray, chain: OdometryChain) -> _Pair:
+    loops, T_mission = _between(map_, a, rows), map_.vertices.T_mission_base
     chi2 = np.array([_cycles(loops, each, chain) for each in range(len(rows))])
     runs = np.column_stack([chain.run[loops.a], chain.run[loops.b]])
     is_linked = (runs[:, None] == runs[None]).all(axis=2)
-    members = _clique((np.maximum(chi2, chi2.T) < gate) & is_linked)
-    middle = members[np.argmin(chi2[np.ix_(members, members)].sum(axis=1))]
-    T_mission = map_.vertices.T_mission_base
-    T_a_b = T_mission[loops.a[middle]] @ loops.T_a_b[middle] @ invert(T_mission[loops.b[middle]])
-    return _AgreeingLoops(a, b, len(rows), rows[np.sort(members)], T_a_b)
+    T_a_b = T_mission[loops.a] @ loops.T_a_b @ invert(T_mission[loops.b])
+    return _Pair(a, b, rows, T_a_b, np.where(is_linked, np.maximum(chi2, chi2.T), np.inf))
+
+
+def _largest_set(pair: _Pair, gate: float) -> _AgreeingLoops:
+    """Return the loops between two missions that agree pairwise; the most central one means the transform."""
+    members = _clique(pair.chi2 < gate)
+    middle = members[np.argmin(pair.chi2[np.ix_(members, members)].sum(axis=1))]
+    return _AgreeingLoops(
+        pair.a, pair.b, len(pair.rows), pair.rows[np.sort(members)], pair.T_a_b[middle]
+    )
 
 
 @dataclass(frozen=True, slots=True)

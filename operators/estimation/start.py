@@ -12,6 +12,7 @@ import gtsam
 import numpy as np
 import numpy.typing as npt
 
+from mapstream.operators.estimation.fixing import fixed
 from mapstream.operators.estimation.keys import variable_of
 from mapstream.operators.estimation.noise import Factor
 from mapstream.operators.estimation.problem import Problem, graph_of
@@ -33,9 +34,11 @@ def chordal_map(problem: Problem, loops: IntArray) -> Map:
     rows = rows[(map_.edges.vertex_a[rows] >= 0) & (map_.edges.vertex_b[rows] >= 0)]
     rows = rows[map_.edges.kind[rows] != "imu"]
     poses = map_.T_map_base(np.arange(len(map_.vertices)))
-    held = np.array(sorted(set(_held_poses(problem))), dtype=np.int64)
-    is_planar = _is_planar(map_, poses, rows)
-    poses = _planar(map_, poses, rows, held) if is_planar else _spatial(problem, rows, poses)
+    held = _with_one_of_each_part(map_, rows, np.array(sorted(_held_poses(problem)), np.int64))
+    if _is_planar(map_, poses, rows):
+        poses = _planar(map_, poses, rows, held)
+    else:
+        poses = _spatial(problem, rows, held, poses)
     frames = map_.missions.T_map_mission[map_.vertices.mission]
     return with_poses(map_, np.arange(len(poses)), invert(frames) @ poses)
 
@@ -50,6 +53,18 @@ def _held_poses(problem: Problem) -> dict[int, Factor]:
     absolute = [f for row, f in problem.plain.items() if problem.map.edges.vertex_b[row] < 0]
     ties = [f for f in (*problem.held, *absolute) if isinstance(f, gtsam.PriorFactorPose3)]
     return {f.keys()[0]: f for f in ties if variable_of(f.keys()[0])[0] == "pose"}
+
+
+def _with_one_of_each_part(map_: Map, rows: IntArray, held: IntArray) -> IntArray:
+    """Return the held poses, and the first of each part that the edges connect and that holds none."""
+    from scipy.sparse import coo_array  # noqa: PLC0415  # takes most of a second to import
+    from scipy.sparse.csgraph import connected_components  # noqa: PLC0415
+
+    a, b, num = map_.edges.vertex_a[rows], map_.edges.vertex_b[rows], len(map_.vertices)
+    links = coo_array((np.ones(len(rows)), (a, b)), shape=(num, num))
+    _, part = connected_components(links, directed=False)
+    _, first = np.unique(part, return_index=True)
+    return np.concatenate([held, first[~np.isin(part[first], part[held])]])
 
 
 def _is_planar(map_: Map, poses: FloatArray, rows: IntArray) -> bool:
@@ -111,11 +126,12 @@ def _solved(links: _Links, held: IntArray, known: ComplexArray) -> ComplexArray:
     return found
 
 
-def _spatial(problem: Problem, rows: IntArray, poses: FloatArray) -> FloatArray:
+def _spatial(problem: Problem, rows: IntArray, held: IntArray, poses: FloatArray) -> FloatArray:
     """Return poses (N, 4, 4) by gtsam, which weighs all measurements alike."""
     alike = gtsam.noiseModel.Isotropic.Sigma(6, 1.0)  # it takes no other kind of noise
     factors = {**problem.plain, **problem.loops}
-    chosen = [*_held_poses(problem).values(), *(factors[row] for row in rows.tolist())]
+    ties = [_held_poses(problem).get(key) or fixed(key, poses[key]) for key in held.tolist()]
+    chosen = [*ties, *(factors[row] for row in rows.tolist())]
     graph = graph_of([factor.cloneWithNewNoiseModel(alike) for factor in chosen])
     values = gtsam.InitializePose3.initialize(graph)
     result = poses.copy()
