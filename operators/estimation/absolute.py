@@ -13,12 +13,15 @@ from typing import Any
 import gtsam
 import numpy as np
 
+from mapstream.operators.estimation.edge_ends import edge_name, require_ends
 from mapstream.operators.estimation.keys import key_of
+from mapstream.operators.estimation.landmarks import Shape, shape_of
 from mapstream.operators.estimation.mounts import MountOf
 from mapstream.operators.estimation.noise import Factor, NoiseModels
 from mapstream.operators.estimation.own_factor import OwnFactor, Residual
 from mapstream.operators.estimation.payloads import number_of, payloads
 from mapstream.recordings.maps.model import Map
+from mapstream.streams.errors import EstimationError
 from mapstream.streams.geometry import SE3
 from mapstream.streams.messages.sensors import FloatArray, IntArray
 
@@ -39,8 +42,15 @@ class _Measured:
     mount_key: int | None  # where that is one
 
 
-def _measured(map_: Map, rows: IntArray) -> Iterator[_Measured]:
+def _measured(map_: Map, rows: IntArray, landmark: Shape | None = None) -> Iterator[_Measured]:
+    """Yield the edges; on a landmark they may be if it has this shape, in a frame that is known.
+
+    Raises:
+        EstimationError: If an edge is on something else, or its payload is not one.
+    """
     edges, frames = map_.edges, map_.frames
+    on_landmarks = rows[edges.vertex_a[rows] < 0]
+    _require_landmarks(map_, on_landmarks, landmark)
     mount_of = MountOf(map_)
     for row, payload in payloads(map_, rows).items():
         vertex, frame = int(edges.vertex_a[row]), int(edges.frame[row])
@@ -58,14 +68,28 @@ def _measured(map_: Map, rows: IntArray) -> Iterator[_Measured]:
         )
 
 
+def _require_landmarks(map_: Map, rows: IntArray, shape: Shape | None) -> None:
+    if shape is None:
+        require_ends(map_, rows, "vertex_a")
+    require_ends(map_, rows, "landmark_a")
+    frames = np.append(map_.frames.is_known, True)  # -1 is the map frame itself
+    for row in rows.tolist():
+        found = shape_of(map_.landmarks.kind[map_.edges.landmark_a[row]])
+        if found != shape or not frames[map_.edges.frame[row]]:
+            raise EstimationError(
+                f"{edge_name(map_, row)}: where a landmark is can be measured of a {shape}, in a frame that"
+                f" is known; this is a {found} in frame {map_.edges.frame[row]}"
+            )
+
+
 def pose(map_: Map, rows: IntArray, noise_of: NoiseModels) -> dict[int, Factor]:
     """Return factors on all six directions: T_a_b is T_frame_sensor.
 
     Raises:
-        EstimationError: If a covariance or a payload is not one.
+        EstimationError: If an end, a covariance or a payload is not one.
     """
     factors = {}
-    for m in _measured(map_, rows):
+    for m in _measured(map_, rows, "pose"):
         z, covariance = map_.edges.T_a_b[m.row], map_.edges.covariance[m.row]
         if m.mount_key is None:
             T_sensor_base = SE3(m.T_base_sensor).inverse()
@@ -91,10 +115,10 @@ def position(map_: Map, rows: IntArray, noise_of: NoiseModels) -> dict[int, Fact
     that rotations are observed through motion.
 
     Raises:
-        EstimationError: If a covariance or a payload is not one.
+        EstimationError: If an end, a covariance or a payload is not one.
     """
     factors = {}
-    for m in _measured(map_, rows):
+    for m in _measured(map_, rows, "point"):
         p_frame, covariance = map_.edges.T_a_b[m.row, :3, 3], map_.edges.covariance[m.row, 3:, 3:]
         R, t = m.T_map_frame[:3, :3], m.T_map_frame[:3, 3]
         turned = None if np.array_equal(R, np.eye(3)) else np.ascontiguousarray(R.T)

@@ -14,10 +14,11 @@ from typing import Any
 import gtsam
 import numpy as np
 
+from mapstream.operators.estimation.edge_ends import edge_name, require_ends
 from mapstream.operators.estimation.keys import key_of
 from mapstream.operators.estimation.mounts import sensors_of
 from mapstream.operators.estimation.noise import Factor, NoiseModels
-from mapstream.operators.estimation.payloads import edge_name, pose_from_numbers
+from mapstream.operators.estimation.payloads import pose_from_numbers
 from mapstream.operators.imu.parameters import ImuParameters
 from mapstream.recordings.maps.model import Map
 from mapstream.streams.errors import EstimationError
@@ -228,6 +229,7 @@ def _require_consecutive(map_: Map, rows: IntArray) -> None:
     Raises:
         EstimationError: If one does, or the ends are of two missions, or in the wrong order.
     """
+    require_ends(map_, rows, "vertex_a", "vertex_b")
     vertices, edges = map_.vertices, map_.edges
     order = np.lexsort((vertices.stamp_ns, vertices.mission))
     following = np.full(len(order), -1)

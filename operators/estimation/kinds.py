@@ -14,6 +14,7 @@ from importlib.metadata import entry_points
 import numpy as np
 
 from mapstream.operators.estimation import absolute, inertial, landmarks, relations, relative
+from mapstream.operators.estimation.edge_ends import edge_name
 from mapstream.operators.estimation.noise import Factor, NoiseModels
 from mapstream.recordings.maps.model import Map
 from mapstream.streams.errors import EstimationError
@@ -89,6 +90,9 @@ def make_factors(
         EstimationError: If an edge lacks what its kind needs, or its covariance is not one.
     """
     rows = np.asarray(rows, dtype=np.int64)
+    undefined = rows[~np.isfinite(map_.edges.T_a_b[rows]).all(axis=(1, 2))]
+    if len(undefined):  # gtsam would end without a word, having done nothing
+        raise EstimationError(f"{edge_name(map_, int(undefined[0]))}: its transform is not finite")
     known = makers()
     made: dict[int, Factor] = {}
     kind_of_row = map_.edges.kind[rows]

@@ -13,13 +13,13 @@ import gtsam
 import numpy as np
 
 from mapstream.operators.estimation import planes
+from mapstream.operators.estimation.edge_ends import require_ends
 from mapstream.operators.estimation.keys import key_of
 from mapstream.operators.estimation.mounts import MountOf
 from mapstream.operators.estimation.noise import Factor, NoiseModels
 from mapstream.operators.estimation.own_factor import OwnFactor
-from mapstream.operators.estimation.payloads import edge_name, number_of, payloads
+from mapstream.operators.estimation.payloads import number_of, payloads
 from mapstream.recordings.maps.model import Map
-from mapstream.streams.errors import EstimationError
 from mapstream.streams.messages.sensors import FloatArray, IntArray
 
 Shape = Literal["point", "point2d", "pose", "plane"]
@@ -38,7 +38,7 @@ def seen(map_: Map, rows: IntArray, noise_of: NoiseModels) -> dict[int, Factor]:
         EstimationError: If an edge has no landmark, or its covariance is not one.
     """
     edges = map_.edges
-    require_ends(map_, rows, "landmark_a")
+    require_ends(map_, rows, "vertex_a", "landmark_a")
     shapes = np.array([shape_of(kind) for kind in map_.landmarks.kind[edges.landmark_a[rows]]])
     factors = planes.seen(map_, rows[shapes == "plane"], noise_of)
     for row, shape in zip(rows.tolist(), shapes.tolist(), strict=True):
@@ -53,18 +53,6 @@ def seen(map_: Map, rows: IntArray, noise_of: NoiseModels) -> dict[int, Factor]:
         elif shape == "point":
             factors[row] = _point(map_, row, noise_of)
     return factors
-
-
-def require_ends(map_: Map, rows: IntArray, *columns: str) -> None:
-    """Check that edges end where their kind needs it.
-
-    Raises:
-        EstimationError: If one does not.
-    """
-    for column in columns:
-        missing = rows[getattr(map_.edges, column)[rows] < 0]
-        if len(missing):
-            raise EstimationError(f"{edge_name(map_, int(missing[0]))} needs a {column}")
 
 
 def _point(map_: Map, row: int, noise_of: NoiseModels) -> Factor:
@@ -141,6 +129,7 @@ def distance(map_: Map, rows: IntArray, noise_of: NoiseModels) -> dict[int, Fact
         EstimationError: If the payload has no range, an end is missing, or the variance is not one.
     """
     edges, given, mount_of = map_.edges, payloads(map_, rows), MountOf(map_)
+    require_ends(map_, rows, "vertex_a")
     require_ends(map_, rows[edges.vertex_b[rows] < 0], "landmark_a")
     factors = {}
     for row, payload in given.items():

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from mapstream.operators.estimation.edge_ends import edge_name
 from mapstream.recordings.maps.model import Map
 from mapstream.streams.errors import EstimationError
 from mapstream.streams.geometry import SE3
@@ -76,12 +77,3 @@ def number_of(map_: Map, row: int, payload: Payload, name: str, size: int) -> Fl
             f'{edge_name(map_, row)}: its payload needs "{name}" ({size} numbers), found {payload.get(name)}'
         )
     return values
-
-
-def edge_name(map_: Map, row: int) -> str:
-    """Return how messages call an edge."""
-    edges = map_.edges
-    source = f" of {edges.source[row]}" if edges.source[row] else ""
-    vertex = int(edges.vertex_a[row])
-    where = f" at {map_.vertices.stamp_ns[vertex]} ns" if vertex >= 0 else ""
-    return f"edge {row} ({edges.kind[row]}{source}){where}"

@@ -11,11 +11,11 @@ from typing import Any
 
 import numpy as np
 
+from mapstream.operators.estimation.edge_ends import edge_name, require_ends
 from mapstream.operators.estimation.keys import key_of
-from mapstream.operators.estimation.landmarks import require_ends, shape_of
+from mapstream.operators.estimation.landmarks import shape_of
 from mapstream.operators.estimation.noise import Factor, NoiseModels
 from mapstream.operators.estimation.own_factor import OwnFactor, Residual
-from mapstream.operators.estimation.payloads import edge_name
 from mapstream.recordings.maps.model import Map
 from mapstream.streams.errors import EstimationError
 from mapstream.streams.geometry import hat

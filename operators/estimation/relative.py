@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gtsam
 
+from mapstream.operators.estimation.edge_ends import require_ends
 from mapstream.operators.estimation.noise import Factor, NoiseModels
 from mapstream.recordings.maps.model import Map
 from mapstream.streams.messages.sensors import IntArray
@@ -13,7 +14,11 @@ def between(map_: Map, rows: IntArray, noise_of: NoiseModels) -> dict[int, Facto
     """Return a factor per edge; several between the same two poses are as many factors.
 
     A direction of infinite variance has no information at all: z, roll and pitch of wheels, for instance.
+
+    Raises:
+        EstimationError: If a vertex is missing, or a covariance is not one.
     """
+    require_ends(map_, rows, "vertex_a", "vertex_b")
     edges = map_.edges
     between_of, pose_of = gtsam.BetweenFactorPose3, gtsam.Pose3
     columns = (

@@ -15,7 +15,7 @@ from mapstream.recordings.maps.model import Map
 from mapstream.recordings.maps.tables import Observations
 from mapstream.streams.errors import EstimationError
 from mapstream.streams.geometry import SE3, se3_exp
-from mapstream.streams.messages.constraints import Constraint, LandmarkRef
+from mapstream.streams.messages.constraints import Constraint, LandmarkRef, OuterFrame
 from mapstream.streams.messages.sensors import FloatArray
 from tests.operators.estimation.problems import (
     STEP_NS,
@@ -287,17 +287,45 @@ def test_a_plane_seen_from_behind_is_the_same_plane() -> None:
     assert 2 * solved.factors[row].error(solved.values) < 16
 
 
-def test_relations_of_landmarks_that_have_no_plane_are_refused() -> None:
+def test_edges_on_the_wrong_ends_are_refused() -> None:
+    """Each by name, with what it needs."""
     map_ = with_mission(wander(2, np.random.default_rng(1)))
     map_ = with_landmark(with_landmark(map_, "point", np.eye(4)), "point", np.eye(4))
-    map_ = with_edge(map_, "parallel", landmark_a=0, landmark_b=1, covariance=cov(0.1, 0.1))
-    lost = with_edge(map_, "range", vertex_a=0, payload={"range_m": 1.0}, covariance=cov(1, 1))
-    unmeasured = with_edge(map_, "range", vertex_a=0, landmark_a=0, covariance=cov(1, 1))
-
-    for made, row, message in (
-        (map_, 0, "is between plane and plane, not"),
-        (lost, 1, "needs a landmark_a"),
-        (unmeasured, 1, '"range_m"'),
+    frame = Constraint(
+        stamp_ns=1, kind="position", outer=OuterFrame(name="room"), covariance=cov(1, 1)
+    )
+    map_ = with_constraints(map_, [frame])
+    nan = np.full((4, 4), np.nan)
+    for kind, columns, message in (
+        ("parallel", {"landmark_a": 0, "landmark_b": 1}, "is between plane and plane, not"),
+        ("range", {"vertex_a": 0, "payload": {"range_m": 1.0}}, "needs a landmark_a"),
+        ("range", {"vertex_a": 0, "landmark_a": 0}, '"range_m"'),
+        ("odometry", {"vertex_a": 0}, "needs a vertex_b"),
+        ("odometry", {"vertex_a": 0, "vertex_b": 1, "T_a_b": nan}, "transform is not finite"),
+        ("imu", {"vertex_a": 0}, "needs a vertex_b"),
+        ("gravity", {"landmark_a": 0, "payload": {"up": [0, 0, 1]}}, "needs a vertex_a"),
+        ("gravity", {"vertex_a": 0, "payload": {"up": [0, 1]}}, '"up"'),
+        ("absolute", {"landmark_a": 0}, "can be measured of a pose"),
+        ("position", {"landmark_a": 0, "frame": 0}, "in a frame that is known"),
+        ("position", {}, "needs a landmark_a"),
+        ("landmark", {"vertex_a": 0}, "needs a landmark_a"),
     ):
+        wrong = with_edge(map_, kind, covariance=cov(1, 1), **columns)
+
         with pytest.raises(EstimationError, match=message):
-            make_factors(made, [row], NoiseModels())
+            make_factors(wrong, [len(wrong.edges) - 1], NoiseModels())
+
+
+def test_payloads_that_are_not_what_they_seem_are_refused() -> None:
+    map_ = with_mission(wander(2, np.random.default_rng(1)))
+    for payload, message in (
+        (b"{", "its payload is no JSON object"),
+        (b"[1]", "its payload is no JSON object"),
+        (b'{"T_base_sensor": [1, 2]}', "qx, qy, qz, qw"),
+        (b'{"T_base_sensor": [0, 0, 0, 0, 0, 0, 0]}', "qx, qy, qz, qw"),
+    ):
+        wrong = with_edge(map_, "absolute", vertex_a=0, covariance=cov(1, 1))
+        edges = replace(wrong.edges, payload=np.array([payload], dtype=object))
+
+        with pytest.raises(EstimationError, match=message):
+            make_factors(replace(wrong, edges=edges), [0], NoiseModels())
