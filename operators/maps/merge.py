@@ -14,6 +14,7 @@ from mapstream.operators.operator import OperatorConfig
 from mapstream.recordings.maps.combine import select_missions
 from mapstream.recordings.maps.ids import as_keys
 from mapstream.recordings.maps.model import TABLES, Map, from_tables
+from mapstream.recordings.maps.order import in_canonical_order
 from mapstream.recordings.maps.rows import concatenate, shifted, table_digest
 from mapstream.recordings.maps.tables import BoolArray, Frames, IdArray, Journal, references_of
 from mapstream.streams.errors import MapError
@@ -89,8 +90,8 @@ def _common_missions(a: Map, b: Map) -> list[str]:
 
 
 def _content(map_: Map, mission_id: str) -> dict[str, bytes]:
-    """Return a hash by table of what a mission holds, wherever it lies and whatever it is called."""
-    alone = select_missions(map_, [mission_id])
+    """Return a hash by table of what a mission holds, wherever it lies, in any order of rows."""
+    alone = in_canonical_order(select_missions(map_, [mission_id]))
     missions = replace(
         alone.missions,
         name=np.array([""], dtype=object),

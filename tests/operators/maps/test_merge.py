@@ -9,8 +9,10 @@ import pytest
 
 from mapstream.operators.maps.merge import MergeConfig, merge
 from mapstream.recordings.maps import Map, check_map
-from mapstream.recordings.maps.build import add_edges, anchored, with_poses
+from mapstream.recordings.maps.build import add_edges, anchored, append_edges, with_poses
 from mapstream.recordings.maps.combine import select_missions
+from mapstream.recordings.maps.ids import derived_id, id_array
+from mapstream.recordings.maps.tables import Edges, Frames
 from mapstream.streams.errors import MapError
 from mapstream.streams.geometry import SE3
 from mapstream.streams.messages.estimates import RelativePose
@@ -95,6 +97,28 @@ def test_M4_one_id_with_two_contents_is_refused_by_name() -> None:
         MapError, match=rf"mission {MISSION} is in two maps, and its vertices differ"
     ):
         merge([full_map(), moved])
+
+
+def test_M5_the_same_mission_may_have_its_rows_in_another_order() -> None:
+    def with_fixes(names: list[str]) -> Map:
+        """A position in each of two outer frames."""
+        frames = Frames(
+            id=id_array(derived_id("frame", name) for name in names),
+            name=np.array(names, dtype=object),
+        )
+        fixes = Edges(
+            kind=np.array(["position"] * 2, dtype=object),
+            vertex_a=np.array([names.index("enu"), names.index("vicon")]),
+            frame=np.array([0, 1]),
+        )
+        return append_edges(replace(line_map(4), frames=frames), fixes)
+
+    a, b = with_fixes(["enu", "vicon"]), with_fixes(["vicon", "enu"])
+    together, report = merge([a, b])
+
+    assert a.frames.name.tolist() != b.frames.name.tolist()
+    assert report.repeated == (MISSION,)
+    assert together.digest() == a.digest()
 
 
 def test_M4_one_outer_frame_with_two_origins_is_refused() -> None:
