@@ -5,10 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 
-import numpy as np
-
 from mapstream.recordings.maps.model import Map
-from mapstream.recordings.maps.tables import BoolArray
+
+_TOLD = 20  # switched off edges; programs get all
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -66,13 +65,15 @@ class OptimizationReport:
             chi2 = f"chi2 {kind.chi2_before:.6g} -> {kind.chi2_after:.6g}"
             yield f"{kind.count} edges of kind {name}: {chi2}"
         yield f"{len(self.dropped)} switched off"
-        for edge in self.dropped:
+        for edge in sorted(self.dropped, key=lambda each: -each.chi2)[:_TOLD]:
             ends = f"{edge.mission_a[:8]} {edge.stamp_a_ns} ns"
             if edge.mission_b:
                 ends += f" to {edge.mission_b[:8]} {edge.stamp_b_ns} ns"
             yield f"  {edge.kind} in row {edge.row}, {ends}, chi2 {edge.chi2:.3g}"
         if self.rejected_absolute:
             yield f"{len(self.rejected_absolute)} absolute measurements contradict the others"
+        if len(self.dropped) > _TOLD:
+            yield f"  and {len(self.dropped) - _TOLD} more"
         for name, count in self.ignored.items():
             yield f"ignored: {count} edges of kind {name}"
         for name in self.underconstrained:
@@ -97,33 +98,6 @@ def dropped_edges(map_: Map, chi2_of_row: Mapping[int, float]) -> list[DroppedEd
             )
         )
     return dropped
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class LoopScore:
-    """How well false loops were told from true ones."""
-
-    precision: float  # of the loops that were kept, how many are true
-    recall: float  # of the true loops, how many were kept
-    num_false: int
-    num_false_kept: int
-    num_true_dropped: int
-
-
-def score_loops(map_: Map, is_false: BoolArray) -> LoopScore:
-    """Compare the switches of edges with labels (num_edges,) that say which are false."""
-    may_switch = map_.edges.is_switchable
-    kept = map_.edges.switch[may_switch] >= 0.5
-    false = np.asarray(is_false, dtype=bool)[may_switch]
-    num_kept, num_true = int(kept.sum()), int((~false).sum())
-    true_kept = int((kept & ~false).sum())
-    return LoopScore(
-        precision=true_kept / num_kept if num_kept else 1.0,
-        recall=true_kept / num_true if num_true else 1.0,
-        num_false=int(false.sum()),
-        num_false_kept=num_kept - true_kept,
-        num_true_dropped=num_true - true_kept,
-    )
 
 
 def as_one(first: OptimizationReport, second: OptimizationReport) -> OptimizationReport:

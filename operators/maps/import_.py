@@ -30,7 +30,7 @@ class ImportConfig(OperatorConfig):
     """Of one step of a trajectory."""
     translation_sigma_m: PositiveFloat = 0.05
     """Of one step of a trajectory."""
-    are_loops_switchable: bool = False
+    are_loops_switchable: bool = True
     """Whether an optimizer may find loops within a mission of a g2o graph false."""
 
 

@@ -10,11 +10,11 @@ import typer
 
 from mapstream.graph.cli.map.choosing import MissionOption
 from mapstream.graph.cli.options import KeySetList, config_from
-from mapstream.graph.cli.output import JsonFlag, complain, in_place, say, say_json
+from mapstream.graph.cli.output import JsonFlag, complain, in_place, plain, say, say_json
 from mapstream.operators.maps.missions import find_mission
 from mapstream.operators.maps.quality import require_no_worse
 from mapstream.recordings.loop_files import read_loops
-from mapstream.recordings.maps import Map
+from mapstream.recordings.maps import Map, load_map
 from mapstream.recordings.maps.history import change_map
 
 if TYPE_CHECKING:
@@ -30,6 +30,9 @@ def optimize(
     context: typer.Context,
     *,
     keep: KeepFlag = False,
+    labels: Annotated[
+        Path | None, typer.Option(help="Lines of NUMBER and 0 or 1, false, for edges as imported.")
+    ] = None,
     set_: KeySetList = None,
     json: JsonFlag = False,
 ) -> None:
@@ -38,16 +41,23 @@ def optimize(
         OptimizeConfig,
         optimize_map,
     )
+    from mapstream.operators.estimation.scores import read_labels, score_loops  # noqa: PLC0415
 
     folder: Path = context.obj
     config = config_from(OptimizeConfig, set_)
     settings = config.model_dump(mode="json", exclude_defaults=True)
     tool = _guarded(lambda map_: optimize_map(map_, config), keep=keep)
+    is_false = read_labels(labels) if labels is not None else None
     report = change_map(folder, "optimize", tool, **settings)
+    score = score_loops(load_map(folder), is_false) if is_false is not None else None
     if json:
-        say_json(report)
-    else:
-        _tell(folder, report)
+        say_json(report if score is None else {**plain(report), "score": plain(score)})
+        return
+    _tell(folder, report)
+    if score is not None:
+        kept = f"{score.num_false_kept} of {score.num_false} false loops kept"
+        dropped = f"{score.num_true_dropped} true ones dropped"
+        say(f"{kept}, {dropped}: precision {score.precision:.4f}, recall {score.recall:.4f}")
 
 
 def relax(  # noqa: PLR0913  # one for each option of the command

@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from mapstream.operators.estimation.batch import OptimizeConfig, optimize_map
 from mapstream.operators.estimation.consistency import cycle_chi2
-from mapstream.operators.estimation.report import score_loops
+from mapstream.operators.estimation.scores import read_labels, score_loops
 from mapstream.recordings.g2o import read_g2o
 from mapstream.recordings.maps.build import add_edges
 from mapstream.recordings.maps.model import Map
 from mapstream.recordings.maps.submaps import append_submap
+from mapstream.streams.errors import RecordingError
 from mapstream.streams.geometry import SE3
 from mapstream.streams.messages.estimates import RelativePose
 from tests.data import shared
@@ -110,6 +112,15 @@ def test_a_cycle_with_odometry_is_within_its_covariance() -> None:
     np.testing.assert_allclose(chi2[len(true) :], chi2[: len(true)], rtol=0.1)
 
 
+@pytest.mark.parametrize("text", ["0 0\n2 1\n", "a b\n", "0\n1\n"])
+def test_labels_that_are_none_are_refused(tmp_path: Path, text: str) -> None:
+    file = tmp_path / "false.labels"
+    file.write_text(text)
+
+    with pytest.raises(RecordingError, match=r"false\.labels: expected lines"):
+        read_labels(file)
+
+
 REACHED_M = {
     "intel_out100": 0.05,
     "intel_out500": 0.05,
@@ -131,12 +142,12 @@ def test_false_loops_of_public_pose_graphs_are_dropped(graph: str) -> None:
     rows = np.arange(len(clean.vertices))
     apart = (result.T_map_base(rows) - clean.T_map_base(rows))[:, :3, 3]
     assert np.sqrt((apart**2).sum(axis=1).mean()) < REACHED_M[graph]
-    labels = np.loadtxt(folder / f"{graph}.g2o.labels", dtype=np.int64)[:, 1].astype(bool)
-    score = score_loops(result, labels)
+    score = score_loops(result, read_labels(folder / f"{graph}.g2o.labels"))
     assert (score.precision, score.recall) == (1, 1)
     assert len(report.dropped) == score.num_false
 
 
+@pytest.mark.slow
 def test_a_start_that_is_a_trap_is_left_by_the_chordal_one() -> None:
     """Levenberg-Marquardt from odometry ends at 385.12."""
     map_ = read_g2o(shared("posegraphs") / "MIT.g2o", are_loops_switchable=True)
