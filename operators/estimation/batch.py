@@ -88,7 +88,7 @@ def _round(
         raise EstimationError(describe_failure(error, map_)) from error
     report = replace(_report(problem, best, config), rejected_absolute=rejected)
     report = replace(report, seconds=time.perf_counter() - started)
-    return _result(problem, best), report, problem.plain
+    return _result(problem, best, config), report, problem.plain
 
 
 def _solve(problem: Problem, config: OptimizeConfig, started: float) -> RobustSolution:
@@ -122,9 +122,9 @@ def _values(problem: Problem, start: str, loops: BoolArray) -> Values:
     return chordal_values(problem, rows[loops])
 
 
-def _result(problem: Problem, best: RobustSolution) -> Map:
+def _result(problem: Problem, best: RobustSolution, config: OptimizeConfig) -> Map:
     """Return the map with the new state, and switches with what is known of them."""
-    map_ = with_solution(problem.map, best.values, held=problem.fixed)
+    map_ = with_solution(problem.map, best.values, held=problem.fixed, fix=config.fix)
     switch, variance = map_.edges.switch.copy(), map_.edges.switch_variance.copy()
     rows = list(problem.loops)
     switch[rows] = best.is_true

@@ -15,8 +15,18 @@ from mapstream.operators.estimation.own_factor import OwnFactor, Residual
 from mapstream.recordings.maps.model import Map
 from mapstream.streams.messages.sensors import FloatArray
 
-Fixable = Literal["poses", "velocities", "biases", "landmarks", "frames", "extrinsics"]
-"""What can be held as a whole; `frames` are outer frames."""
+Fixable = Literal[
+    "poses",
+    "velocities",
+    "biases",
+    "landmarks",
+    "frames",
+    "extrinsics",
+    "extrinsics_rotation",
+    "extrinsics_translation",
+    "base_frames",
+]
+"""What can be held as a whole; `frames` are outer frames, `base_frames` those of missions, also where guessed."""
 
 _VARIABLES: dict[Fixable, Variable] = {
     "poses": "pose",
@@ -35,9 +45,9 @@ def fixed(key: int, pose: FloatArray) -> Factor:
 
 
 def fixed_keys(keys: Iterable[int], fix: Iterable[Fixable]) -> set[int]:
-    """Return those of the keys whose kind of variable shall stay."""
+    """Return those of the keys whose kind of variable shall stay, all of it."""
     rows = rows_by_variable(keys)
-    chosen = [_VARIABLES[name] for name in fix]
+    chosen = [_VARIABLES[name] for name in fix if name in _VARIABLES]
     return {key_of(of, row) for of in chosen for row in rows.get(of, np.zeros(0, int)).tolist()}
 
 
@@ -47,6 +57,19 @@ def fixes(map_: Map, values: Any, keys: Iterable[int]) -> list[Factor]:  # noqa:
     A solver may still move them by what rounding leaves; `with_solution(..., held=keys)` keeps their bits.
     """
     return [_hold(map_, values, key) for key in sorted(keys)]
+
+
+def half_fixes(values: Any, fix: Iterable[Fixable]) -> list[Factor]:  # noqa: ANN401
+    """Return factors that hold the rotations, or the translations, of extrinsics where the values have them."""
+    rows = rows_by_variable(values.keys()).get("extrinsics", np.zeros(0, np.int64)).tolist()
+    places = {key: values.atPose3(key) for key in (key_of("extrinsics", row) for row in rows)}
+    made: list[Factor] = []
+    for name in fix:
+        if name == "extrinsics_rotation":
+            made += [gtsam.PoseRotationPrior3D(k, T, _exactly(3)) for k, T in places.items()]
+        elif name == "extrinsics_translation":
+            made += [gtsam.PoseTranslationPrior3D(k, T, _exactly(3)) for k, T in places.items()]
+    return made
 
 
 def _hold(map_: Map, values: Any, key: int) -> Factor:  # noqa: ANN401

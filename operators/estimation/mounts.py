@@ -8,7 +8,7 @@ that it made name it in their payload: {"sensor": NAME}.
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -20,6 +20,8 @@ from mapstream.recordings.maps.model import Map
 from mapstream.streams.errors import EstimationError
 from mapstream.streams.geometry import SE3
 from mapstream.streams.messages.sensors import FloatArray
+
+_HERE = [0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -76,16 +78,23 @@ class MountOf:
         return mount.T_base_sensor, mount.key
 
 
-def with_mounts(map_: Map, T_base_sensor: Mapping[int, FloatArray]) -> Map:
-    """Return the map with other places (4, 4) of sensors, by the rows of `mounts`."""
+def with_mounts(
+    map_: Map, T_base_sensor: Mapping[int, FloatArray], fix: Collection[str] = ()
+) -> Map:
+    """Return the map with other places (4, 4) of sensors, by the rows of `mounts`.
+
+    With `extrinsics_rotation` or `extrinsics_translation` in `fix` that half keeps its numbers.
+    """
     all_mounts = mounts(map_)
     sensors = map_.missions.sensors.copy()
     for mission in sorted({all_mounts[row].mission for row in T_base_sensor}):
         described = json.loads(sensors[mission])
         for row in _rows_of(mission, all_mounts, T_base_sensor):
-            pose = SE3(T_base_sensor[row])
-            numbers = [*pose.t.tolist(), *pose.quat_xyzw.tolist()]
-            described[all_mounts[row].name]["T_base_sensor"] = numbers
+            pose, description = SE3(T_base_sensor[row]), described[all_mounts[row].name]
+            before = description.get("T_base_sensor", _HERE)
+            t = before[:3] if "extrinsics_translation" in fix else pose.t.tolist()
+            quat = before[3:] if "extrinsics_rotation" in fix else pose.quat_xyzw.tolist()
+            description["T_base_sensor"] = [*t, *quat]
         sensors[mission] = json.dumps(described)
     return replace(map_, missions=replace(map_.missions, sensors=sensors))
 

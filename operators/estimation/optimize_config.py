@@ -41,7 +41,8 @@ class OptimizeConfig(BaseModel):
     loss_width: PositiveFloat = 1.0
     """Where losses begin to flatten, in units of where each usually does."""
     fix: tuple[Fixable, ...] = ()
-    """Variables that stay as they are: poses, velocities, biases, landmarks, frames, extrinsics."""
+    """What stays as it is: poses, velocities, biases, landmarks, frames (outer ones), extrinsics,
+    extrinsics_rotation, extrinsics_translation, base_frames (of missions)."""
     underconstrained: Literal["error", "prior"] = "error"
     """What happens to variables that the edges do not determine: a weak prior holds them, or none."""
     reject_absolute: bool = False

@@ -12,7 +12,7 @@ import gtsam
 import numpy as np
 
 from mapstream.operators.estimation.consistency import chi2_gate
-from mapstream.operators.estimation.fixing import fixed_keys, fixes
+from mapstream.operators.estimation.fixing import fixed_keys, fixes, half_fixes
 from mapstream.operators.estimation.gauge import gauge_factors
 from mapstream.operators.estimation.keys import variable_of
 from mapstream.operators.estimation.kinds import make_factors, makers
@@ -99,7 +99,7 @@ def make_problem(map_: Map, config: OptimizeConfig) -> Problem:
         held += gauge_factors(map_, factors)
     values = initial_values(map_, graph_of([*held, *factors.values()]).keyVector())
     fixed = fixed_keys(values.keys(), config.fix)
-    held += fixes(map_, values, fixed)
+    held += [*fixes(map_, values, fixed), *half_fixes(values, config.fix)]
     return Problem(
         map=map_,
         plain=plain,

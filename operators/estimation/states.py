@@ -12,6 +12,7 @@ from typing import Any
 import gtsam
 import numpy as np
 
+from mapstream.operators.estimation.fixing import Fixable
 from mapstream.operators.estimation.keys import Variable, key_of, rows_by_variable
 from mapstream.operators.estimation.landmark_states import insert_landmarks, with_landmarks
 from mapstream.operators.estimation.mounts import mounts, with_mounts
@@ -35,19 +36,22 @@ def initial_values(map_: Map, keys: Iterable[int]) -> Values:
     return values
 
 
-def with_solution(map_: Map, values: Values, held: Collection[int] = ()) -> Map:
+def with_solution(
+    map_: Map, values: Values, held: Collection[int] = (), fix: Collection[Fixable] = ()
+) -> Map:
     """Return the map with the state in these values; a guessed base frame moves with its first vertex.
 
     Args:
         map_: The map that the values came from.
         values: Of any of its variables; the others stay.
         held: Keys of variables that the solver did not move: their rows stay bit for bit.
+        fix: What else stays: `base_frames`, the halves of extrinsics.
     """
     present = rows_by_variable(values.keys())
     moved = rows_by_variable(set(values.keys()) - set(held)) if held else present
     nothing = np.zeros(0, np.int64)
     before = map_
-    map_ = _with_poses(map_, moved.get("pose", nothing), values)
+    map_ = _with_poses(map_, moved.get("pose", nothing), values, frames_stay="base_frames" in fix)
     map_ = _with_velocities(map_, moved.get("velocity", nothing), values)
     map_ = _with_biases(map_, moved.get("bias", nothing), values)
     landmarks = present.get("landmark", nothing)
@@ -61,7 +65,7 @@ def with_solution(map_: Map, values: Values, held: Collection[int] = ()) -> Map:
         row: values.atPose3(key_of("extrinsics", row)).matrix()
         for row in moved.get("extrinsics", nothing).tolist()
     }
-    return with_mounts(map_, places) if places else map_
+    return with_mounts(map_, places, fix) if places else map_
 
 
 def _insert_poses(map_: Map, rows: IntArray, values: Values) -> None:
@@ -126,7 +130,7 @@ def _insert_each(values: Values, variable: Variable, rows: IntArray, poses: Floa
         values.insert(key_of(variable, row), gtsam.Pose3(pose))
 
 
-def _with_poses(map_: Map, rows: IntArray, values: Values) -> Map:
+def _with_poses(map_: Map, rows: IntArray, values: Values, *, frames_stay: bool) -> Map:
     """Return the map with new poses; what does not move keeps its bits, and its base frame."""
     if not len(rows):
         return map_
@@ -135,7 +139,8 @@ def _with_poses(map_: Map, rows: IntArray, values: Values) -> Map:
     moves = np.zeros(len(poses), bool)
     moves[rows] = True
     frames = map_.missions.T_map_mission.copy()
-    for mission in np.flatnonzero(~map_.missions.is_base_frame_known).tolist():
+    is_guess = ~map_.missions.is_base_frame_known & (not frames_stay)
+    for mission in np.flatnonzero(is_guess).tolist():
         vertices = map_.vertices_of(mission)
         if len(vertices) and moves[vertices[0]]:
             first = vertices[0]

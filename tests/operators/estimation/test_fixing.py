@@ -6,6 +6,7 @@ import json
 import subprocess
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import get_args
 
@@ -108,6 +109,36 @@ def test_F11_what_is_fixed_keeps_its_bits_and_the_rest_moves(fix: Fixable) -> No
     for shape, place in before.items():
         moved = np.abs(after[shape] - place).max()
         assert moved < 1e-9 if fix == "landmarks" else moved > 1e-6, shape
+
+
+@pytest.mark.parametrize("half", ["extrinsics_rotation", "extrinsics_translation"])
+def test_F11_half_of_the_extrinsics_stays(half: Fixable) -> None:
+    map_, _ = everything()
+    halves = {"extrinsics_rotation": slice(3, 7), "extrinsics_translation": slice(0, 3)}
+    before = STATES["extrinsics"](map_)
+
+    solved, _ = optimize_map(map_, OptimizeConfig(fix=(half,)))
+
+    after = STATES["extrinsics"](solved)
+    for name, part in halves.items():
+        assert np.array_equal(after[part], before[part]) == (name == half), name
+
+
+@pytest.mark.parametrize("fix", [(), ("base_frames",)])
+def test_F11_a_guessed_base_frame_stays_if_it_is_fixed(fix: tuple[Fixable, ...]) -> None:
+    map_, _ = everything()
+    unknown = replace(map_.missions, is_base_frame_known=np.array([False]))
+    map_ = replace(map_, missions=unknown)
+
+    solved, _ = optimize_map(map_, OptimizeConfig(fix=fix))
+
+    stayed = np.array_equal(solved.missions.T_map_mission, map_.missions.T_map_mission)
+    assert stayed == bool(fix)
+    np.testing.assert_allclose(
+        solved.T_map_base(np.arange(NUM)),
+        optimize_map(map_)[0].T_map_base(np.arange(NUM)),
+        atol=1e-9,
+    )
 
 
 def test_F11_all_at_once_leaves_the_map_as_it_is() -> None:
