@@ -16,6 +16,7 @@ import numpy as np
 from mapstream.operators.estimation.absolute_outliers import reject_absolute
 from mapstream.operators.estimation.determinacy import determined
 from mapstream.operators.estimation.inertial import outdated
+from mapstream.operators.estimation.landmark_starts import averaged_landmarks
 from mapstream.operators.estimation.noise import Factor
 from mapstream.operators.estimation.optimize_config import OptimizeConfig
 from mapstream.operators.estimation.problem import (
@@ -63,6 +64,8 @@ def optimize_map(map_: Map, config: OptimizeConfig | None = None) -> tuple[Map, 
     """
     config = config or OptimizeConfig()
     started = time.perf_counter()
+    if config.start_landmarks == "mean":
+        map_ = averaged_landmarks(map_)
     result, report, plain = _round(map_, config, started)
     for _ in range(_MOST_INTEGRATIONS - 1):
         if not outdated(result, plain):

@@ -20,6 +20,8 @@ class OptimizeConfig(BaseModel):
     """`sparse` is a second implementation, on SciPy, of poses alone: for checks."""
     start: Literal["auto", "current", "chordal"] = "auto"
     """Where the poses begin; auto tries the chordal start where the current one ends in a contradiction."""
+    start_landmarks: Literal["current", "mean"] = "current"
+    """Where 3D points begin: where they are, or at the mean of all that was seen of them."""
     max_iterations: PositiveInt = 100
     """Of each descent; there are several where loops are switched."""
     max_seconds: PositiveFloat | None = None

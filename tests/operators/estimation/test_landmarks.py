@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from mapstream.operators.estimation import planes
+from mapstream.operators.estimation.batch import OptimizeConfig, optimize_map
 from mapstream.operators.estimation.kinds import make_factors
 from mapstream.operators.estimation.landmark_starts import averaged_landmarks
 from mapstream.operators.estimation.noise import NoiseModels
@@ -118,6 +119,22 @@ def test_E3_a_point_begins_at_the_mean_of_its_observations() -> None:
     np.testing.assert_allclose(starts, in_map.reshape(5, 3, 3).mean(axis=0), atol=1e-9)
     sixth = truth[2, :3, :3] @ extra[0] + truth[2, :3, 3]
     np.testing.assert_allclose(more[0, :3, 3], (5 * starts[0] + sixth) / 6, atol=1e-6)
+
+
+def test_E3_an_optimisation_may_begin_with_the_means() -> None:
+    rng = np.random.default_rng(6)
+    truth = wander(5, rng)
+    map_ = with_relative(
+        with_mission(truth), [(a, a + 1) for a in range(4)], truth, cov(0.01, 0.05), rng=rng
+    )
+    map_ = with_constraints(map_, observed(truth, "point", rng, (0.005, 0.01)))
+    far = with_landmarks_moved(map_, rng, 50.0)
+
+    optimised, report = optimize_map(far, OptimizeConfig(start_landmarks="mean"))
+
+    assert report.error_before < optimize_map(far)[1].error_before / 100
+    found = optimised.T_map_landmark(np.arange(3))[:, :3, 3]
+    assert np.linalg.norm(found - PLACES[:, :3, 3], axis=1).max() < 0.05
 
 
 @pytest.mark.parametrize("seed", range(3))
