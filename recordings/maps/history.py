@@ -25,6 +25,7 @@ def change_map(
     path: Path | str,
     operation: str,
     tool: Callable[[Map], tuple[Map, ReportT]],
+    /,
     **parameters: object,
 ) -> ReportT:
     """Let a tool change the map in a folder, note it in the map's journal, and return the tool's report.
