@@ -14,7 +14,8 @@ from typing import Self
 _SERVER = """
 import json, os, sys, tempfile
 from mapstream.graph.cli import main
-import mapstream.graph.cli.map, mapstream.graph.cli.run  # what most commands need, before the fork
+import scipy.sparse.csgraph  # what most commands need, before the fork
+import mapstream.graph.cli.map, mapstream.graph.cli.run, mapstream.operators.estimation.batch
 
 for line in sys.stdin:
     with tempfile.TemporaryFile("w+") as output:

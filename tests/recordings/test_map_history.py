@@ -88,7 +88,7 @@ def test_M19_any_order_of_changes_undos_and_redos_is_that_of_two_stacks(
 
 def test_M19_only_the_newest_states_are_kept(tmp_path: Path) -> None:
     save_map(line_map(3), tmp_path)
-    for number in range(25):
+    for number in range(21):
         shift(tmp_path, number)
 
     manifest = read_manifest(tmp_path)
