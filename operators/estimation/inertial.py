@@ -139,10 +139,9 @@ class _Settings:
         self.params.setBiasAccCovariance(np.eye(3) * parameters.accel_random_walk**2)
         self.params.setBiasOmegaCovariance(np.eye(3) * parameters.gyro_random_walk**2)
         if not np.array_equal(T_base_sensor[:3, :3], np.eye(3)):
+            # gtsam's own lever arm forgets turns that speed up; `_at_base` takes it out instead
             turned = gtsam.Pose3(gtsam.Rot3(T_base_sensor[:3, :3]), np.zeros(3))
-            self.params.setBodyPSensor(
-                turned
-            )  # turned only: gtsam's lever arm forgets turns that speed up
+            self.params.setBodyPSensor(turned)
         self._densities = (parameters.gyro_density, parameters.accel_density)
         self._is_raised: bool | None = None
         self.use(saturated=False)
@@ -164,12 +163,8 @@ def _at_knots(
     stamps_ns, first = np.unique(samples.stamps_ns, return_index=True)
     inside = stamps_ns[(stamps_ns > start_ns) & (stamps_ns < end_ns)]
     knots_ns = np.array([start_ns, *inside, end_ns], dtype=np.int64)
-    around = stamps_ns[
-        max(np.searchsorted(stamps_ns, start_ns, side="right") - 1, 0) : np.searchsorted(
-            stamps_ns, end_ns
-        )
-        + 1
-    ]
+    before = max(int(np.searchsorted(stamps_ns, start_ns, side="right")) - 1, 0)
+    around = stamps_ns[before : int(np.searchsorted(stamps_ns, end_ns)) + 1]
     reach_ns = np.array([min(start_ns, *around[:1]), *around, max(end_ns, *around[-1:])])
     gap_ns = int(np.diff(reach_ns).max(initial=0)) if len(around) else end_ns - start_ns
     if not len(around) or gap_ns > _MAX_GAP_NS:

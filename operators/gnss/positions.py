@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass
 
 import numpy as np
@@ -33,6 +34,8 @@ class GnssConfig(OperatorConfig):
     """The same, of heights."""
     min_sigma_m: NonNegativeFloat = 0.005
     """Receivers that say they are better than this are not believed."""
+    sensor: str = ""
+    """Name of the antenna among the mounts of `trajectory`, if an optimizer shall find where it sits."""
     is_switchable: bool = False
     """An optimizer may find that a position is false."""
 
@@ -62,6 +65,7 @@ class Gnss(Operator[Inputs, Outputs]):
         self._config = config
         self._plane: GeodeticPlane | None = None
         self._outer: OuterFrame | None = None
+        self._payload = json.dumps({"sensor": config.sensor}).encode() if config.sensor else b""
         if config.origin_lla is not None:
             self._begin(config.origin_lla)
 
@@ -102,8 +106,9 @@ class Gnss(Operator[Inputs, Outputs]):
             kind="position",
             T_a_b=SE3.from_rotation(np.eye(3), place),
             covariance=covariance,
-            T_base_sensor=fix.T_base_sensor,
+            T_base_sensor=SE3.identity() if self._payload else fix.T_base_sensor,
             outer=self._outer,
+            payload=self._payload,
             is_switchable=self._config.is_switchable,
             source=fix.frame,
         )

@@ -74,6 +74,17 @@ class ImuConfig(ImuQuality):
         return ImuParameters(**quality, T_base_sensor=place).description()
 
 
+class MountConfig(OperatorConfig):
+    """A sensor whose place on the robot an optimizer finds; its measurements name it."""
+
+    T_base_sensor: Annotated[tuple[float, ...], Field(min_length=7, max_length=7)]
+    """Where it is thought to sit: x, y, z [m] and the quaternion x, y, z, w."""
+    extrinsics_sigma_rad: PositiveFloat = 0.1
+    """How far it may be turned from there."""
+    extrinsics_sigma_m: PositiveFloat = 0.1
+    """How far it may sit from there."""
+
+
 class ConstraintsConfig(OperatorConfig):
     """An input that gets `Constraint`."""
 
@@ -93,6 +104,8 @@ class TrajectoryConfig(OperatorConfig):
     """With an IMU: an input `imu`, and its noise."""
     constraints: dict[str, ConstraintsConfig] = Field(default_factory=dict)
     """Inputs of measurements on poses, by name."""
+    mounts: dict[str, MountConfig] = Field(default_factory=dict)
+    """Sensors whose place an optimizer finds, by the name that their measurements give."""
     clouds: bool = False
     """An input `clouds`: poses are made where clouds are, and keep them."""
     bridge: Literal["none", "still", "constant_velocity"] = "still"
@@ -122,6 +135,8 @@ class TrajectoryConfig(OperatorConfig):
         twice = sorted({name for name in names if names.count(name) > 1})
         if twice:
             raise ValueError(f"two inputs are called {twice[0]}; give each a name of its own")
+        if {"imu", "sources"} & set(self.mounts):
+            raise ValueError("a mount is called neither imu nor sources; the map keeps others there")
         return self
 
     def described(self, T_base_imu: SE3) -> str:
@@ -129,6 +144,8 @@ class TrajectoryConfig(OperatorConfig):
         sensors: dict[str, object] = {
             "sources": {name: source.model_dump() for name, source in self.sources.items()}
         }
+        for name, mount in self.mounts.items():
+            sensors[name] = {**mount.model_dump(), "is_extrinsics_estimated": True}
         if self.imu is not None:
             sensors["imu"] = self.imu.described(T_base_imu)
         return json.dumps(sensors, sort_keys=True)

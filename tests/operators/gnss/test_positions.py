@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+
 import numpy as np
 import pytest
 
@@ -9,6 +11,7 @@ from mapstream.operators.gnss.geodesy import GeodeticPlane
 from mapstream.operators.gnss.positions import Gnss, GnssConfig
 from mapstream.operators.operator import Context
 from mapstream.operators.testing import run_operator
+from mapstream.operators.trajectory.config import TrajectoryConfig
 from mapstream.streams.geometry import SE3
 from mapstream.streams.messages.constraints import Constraint
 from mapstream.streams.messages.sensors import FloatArray, GnssFix
@@ -140,3 +143,30 @@ async def test_F9_fixes_without_a_position_are_refused_and_counted() -> None:
     assert np.isfinite(flat.covariance[3:5, 3:5]).all()
     assert sum(context.activity.losses.values()) == 4
     assert len(context.activity.losses) == 4
+
+
+async def test_F8_F9_the_antenna_is_found_where_a_graph_file_asks_for_it() -> None:
+    """Thought at the base, it sits half a metre off; turns in all directions show it."""
+    rng = np.random.default_rng(4)
+    truth = wander(40, rng)
+    plane = GeodeticPlane.at("enu", ORIGIN)
+    fixes = [
+        fix(
+            plane.to_lla(((SE3(pose) @ ANTENNA).t + rng.normal(0, 0.02, 3))[None])[0],
+            1 + at * STEP_NS,
+            covariance_enu_m2=np.eye(3) * 0.02**2,
+        )
+        for at, pose in enumerate(truth)
+    ]
+    place = [0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0]
+    mounts = {"antenna": {"T_base_sensor": place, "extrinsics_sigma_m": 1.0}}
+    trajectory = TrajectoryConfig.model_validate({"mounts": mounts})
+    map_ = with_mission(truth, sensors=json.loads(trajectory.described(SE3.identity())))
+    pairs = [(a, a + 1) for a in range(39)]
+    map_ = with_relative(map_, pairs, truth, cov(0.002, 0.01), rng=rng)
+    made = await positions(fixes, sensor="antenna", origin_lla=ORIGIN, is_map_frame=True)
+
+    solved = Solved(disturbed(with_constraints(map_, made), rng, 0.02, 0.1), hold=()).map
+
+    found = json.loads(solved.missions.sensors[0])["antenna"]["T_base_sensor"]
+    np.testing.assert_allclose(found[:3], ANTENNA.t, atol=0.05)
