@@ -11,7 +11,12 @@ from mapstream.operators.estimation.batch import (
     OptimizeConfig,
     optimize_map,
 )
-from mapstream.operators.estimation.first_fixes import FirstFixes, headed, is_linked
+from mapstream.operators.estimation.first_fixes import (
+    FirstFixes,
+    headed,
+    is_linked,
+    without_false_fixes,
+)
 from mapstream.operators.estimation.gauge import gauge_factors
 from mapstream.operators.estimation.incremental import IncrementalProblem
 from mapstream.operators.estimation.inertial import outdated
@@ -103,7 +108,10 @@ class LiveMap:
         Raises:
             EstimationError: If the map has no finite solution.
         """
-        self.map, report = optimize_map(self.ordered(), self._config)
+        self.map = self.ordered()
+        if "position" in self._config.losses:
+            self.map = without_false_fixes(self.map, self._softened)
+        self.map, report = optimize_map(self.map, self._config)
         return report
 
     def correction(self, mission_id: str) -> MapCorrection:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import gtsam
 import numpy as np
@@ -22,7 +22,8 @@ from mapstream.streams.messages.sensors import IntArray
 _MIN_SPREAD_M = 10.0
 _LINKS = ("odometry", "wheel", "registration")  # say how the robot moved, however it headed
 _MAX_ITERATIONS = 25
-_WIDENINGS = (100.0, 10.0, 1.0)  # of robust losses: at first all fixes count, then the likely ones
+_FALSE = 0.5  # a fix whose loss flattened its error to less than this is taken for false
+_WIDENINGS = (100.0, 25.0, 12.0, 6.0)  # of robust losses: at first all fixes count, then the likely ones
 
 
 @dataclass(slots=True)
@@ -97,15 +98,43 @@ def headed(map_: Map, fixes: IntArray, softened: Softening) -> Map:
     """
     mission = int(map_.vertices.mission[map_.edges.vertex_a[fixes[0]]])
     wide, *narrower = _WIDENINGS
-    starts = headings(map_, mission, fixes)
-    solutions = [_solved(start, mission, softened, wide) for start in starts]
-    best = min(solutions, key=lambda solution: solution.error)
+    best = _Solution(map_, np.inf)
+    for start in headings(map_, mission, fixes):
+        found = _solved(start, mission, softened, wide)
+        is_confirmed = bool(np.isfinite(found.error)) and abs(found.error / best.error - 1) < 0.01
+        best = min(best, found, key=lambda solution: solution.error)
+        if is_confirmed:  # two headings lead to one solution, and none so far to a better one
+            break
     for widening in narrower:
         best = _solved(best.map, mission, softened, widening)
     if not np.isfinite(best.error):
         name = map_.mission_id(mission)
         raise EstimationError(f"mission {name}: no heading makes sense of its position fixes")
     return best.map
+
+
+def without_false_fixes(map_: Map, softened: Softening) -> Map:
+    """Return the map with inertial missions along their fixes, of which those that stay far off are switched off.
+
+    Between two fixes a second apart an IMU leaves no doubt; the longer it is alone, the less it can tell.
+    """
+    edges = map_.edges
+    fixes = np.flatnonzero((edges.kind == "position") & (edges.vertex_a >= 0))
+    missions = map_.vertices.mission[edges.vertex_a[fixes]]
+    switch = edges.switch.copy()
+    for mission in np.unique(missions).tolist():
+        own = fixes[missions == mission]
+        if _is_linked(map_, mission):
+            continue
+        map_ = headed(map_, own, softened)
+        factors = make_factors(map_, own, NoiseModels())
+        values = initial_values(map_, {key for f in factors.values() for key in f.keys()})  # noqa: SIM118
+        for row, factor in factors.items():
+            # Under a redescending loss at its inflection and beyond, a fix has no say any more.
+            plain = float(factor.error(values))
+            soft = float(softened(row, factor, _WIDENINGS[-1]).error(values))
+            switch[row] = 0.0 if soft < _FALSE * plain else switch[row]
+    return replace(map_, edges=replace(map_.edges, switch=switch))
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,6 +11,9 @@ from bisect import bisect_left, insort
 from collections import Counter
 from itertools import takewhile
 
+import numpy as np
+
+from mapstream.operators.odometry.continuous import Motion
 from mapstream.operators.trajectory.dead_reckoning import LEVELLING_NS, DeadReckoning
 from mapstream.operators.trajectory.links import Links
 from mapstream.operators.trajectory.window import CommitWindow
@@ -128,12 +131,15 @@ class TrajectoryBuilder:
         newest_ns = self._out[-1]
         for source in self._links.sources.values():
             if source.covers(newest_ns, stamp_ns):
-                motion = source.between(newest_ns, stamp_ns)
+                start, end = (source.state_at(s).T_odom_base for s in (newest_ns, stamp_ns))
+                motion = Motion(start.inverse() @ end, np.zeros((6, 6)), is_measured=False)
                 return self._reckoning.reached(newest_ns, stamp_ns, motion)
         if self._links.imu is None or not self._links.imu.measures(newest_ns, stamp_ns):
             reason = f"no source of motion reaches from the pose at {newest_ns} ns"
             raise EstimationError(f"nothing is known of {stamp_ns} ns: {reason}")
-        if newest_ns < self._ahead_ns < stamp_ns:  # go on from there: integrating all again takes long
+        if (
+            newest_ns < self._ahead_ns < stamp_ns
+        ):  # go on from there: integrating all again takes long
             newest_ns = self._ahead_ns
         self._ahead_ns = stamp_ns
         return self._reckoning.go_on(newest_ns, stamp_ns, None)
