@@ -28,7 +28,7 @@ def gap(map_: Map, first: int, last: int, across: str = "link") -> Gap:
     return Gap(start_ns=int(stamps_ns[first]), end_ns=int(stamps_ns[last]), across=across)  # type: ignore[arg-type]  # checked
 
 
-@settings(max_examples=30)
+@settings(max_examples=15)
 @given(st.integers(0, 7), st.integers(0, 7), st.sampled_from(["link", "split"]))
 def test_M17_what_stays_is_a_clean_map(a: int, b: int, across: str) -> None:
     for whole in (full_map(), line_map(8)):
