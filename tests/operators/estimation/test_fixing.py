@@ -149,6 +149,7 @@ def test_F11_all_at_once_leaves_the_map_as_it_is() -> None:
     assert solved.digest() == map_.digest()
 
 
+@pytest.mark.slow
 def test_F18_a_package_adds_a_kind_of_edges(tmp_path: Path) -> None:
     """A height difference between poses at two times: a factor of the package's own, no line of the core."""
     site = look_installed(tmp_path / "site", [EXAMPLE / "pyproject.toml"])
