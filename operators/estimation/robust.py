@@ -62,6 +62,7 @@ class Descent:
         self._iterations = 0
         rows = np.fromiter(problem.loops, dtype=np.int64)
         cycle = cycle_chi2(problem.map, rows) if len(rows) else np.zeros(0)
+        self._is_untested: BoolArray = np.isnan(cycle)  # between missions, for instance
         self.may_be_true: BoolArray = ~(cycle > self._gate)  # NaN: odometry does not say
 
     def contradicts_odometry(self) -> bool:
@@ -102,7 +103,7 @@ class Descent:
         count = max(_FEW, int(_SECOND_CHANCES * solution.is_true.sum()))
         plausible = solution.is_true.copy()
         plausible[np.argsort(excess, kind="stable")[:count]] = True
-        return plausible & self.may_be_true
+        return (plausible | self._is_untested) & self.may_be_true
 
     def _softened(self, start: Values, widening: float, candidates: BoolArray) -> Values:
         """Return the minimum of the Geman-McClure cost over the candidates."""
@@ -111,9 +112,10 @@ class Descent:
             loop.cloneWithNewNoiseModel(switchable(loop.noiseModel(), phi))
             for loop, phi in zip(self._loops, width.tolist(), strict=True)
         ]
+        reach = _NEGLIGIBLE * np.where(self._is_untested, width, self._gate)
         values, before = start, np.zeros(0, dtype=bool)
         for _ in range(_MAX_ROUNDS):
-            near = candidates & (self._chi2(values) < _NEGLIGIBLE * self._gate)
+            near = candidates & (self._chi2(values) < reach)
             graph = self._with([softened[k] for k in np.flatnonzero(near).tolist()])
             solved = self._solve(graph, values, _ROUND_ITERATIONS)
             values = solved.values
