@@ -148,19 +148,27 @@ class LiveMap:
         fresh = {name: row for name, row in rows.items() if name not in self._seen}
         waiting = self._fixes.waiting(self.map, fresh.values())
         named = self._made([row for row in fresh.values() if row not in waiting])
-        self._seen |= named.keys()
         inertial = {rows[n]: f for n, f in named.items() if self.map.edges.kind[rows[n]] == "imu"}
         self.map = dead_reckoned(self.map, inertial, new_vertices)
+        asleep = self._fixes.asleep(self.map)
+        named = {n: f for n, f in named.items() if self._mission_of(rows[n]) not in asleep}
+        self._seen |= named.keys()
         if meeting:
             for fixes in meeting:
                 self.map = headed(self.map, fixes, self._softened)
             self._start_anew()
+            return
+        if not named and not gone:
             return
         added = named | self._holds({rows[n]: f for n, f in named.items()}, new_vertices)
         values = initial_values(self.map, self._problem.new_keys(added.values()))
         self._problem.update(values, added, gone & self._problem.names)
         self._take()
         self._integrate_anew(rows)
+
+    def _mission_of(self, edge: int) -> int:
+        vertex = self.map.edges.vertex_a[edge]
+        return int(self.map.vertices.mission[vertex]) if vertex >= 0 else -1
 
     def _made(self, rows: Sequence[int]) -> dict[bytes, Factor]:
         """Return a factor by name for each of these edges whose kind is known."""

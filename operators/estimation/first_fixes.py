@@ -23,7 +23,12 @@ _MIN_SPREAD_M = 10.0
 _LINKS = ("odometry", "wheel", "registration")  # say how the robot moved, however it headed
 _MAX_ITERATIONS = 25
 _FALSE = 0.5  # a fix whose loss flattened its error to less than this is taken for false
-_WIDENINGS = (100.0, 25.0, 12.0, 6.0)  # of robust losses: at first all fixes count, then the likely ones
+_WIDENINGS = (
+    100.0,
+    25.0,
+    12.0,
+    6.0,
+)  # of robust losses: at first all fixes count, then the likely ones
 
 
 @dataclass(slots=True)
@@ -40,6 +45,13 @@ class FirstFixes:
         return {row for row in fixes if self._group(map_, row) not in self.met} - self._free(
             map_, fixes
         )
+
+    def asleep(self, map_: Map) -> set[int]:
+        """Return the missions that an IMU leads along alone, and no fixes yet: there is nothing to solve."""
+        awake = {mission for mission, _ in self.met}
+        inertial = map_.vertices.mission[map_.edges.vertex_a[map_.edges_of("imu")]]
+        alone = {m for m in np.unique(inertial).tolist() if not _is_linked(map_, m)}
+        return alone - awake
 
     def meet(self, map_: Map) -> list[IntArray]:
         """Return the fixes of each mission and frame that meet now, since there are enough of them."""

@@ -11,13 +11,15 @@ from typing import Any
 import gtsam
 import numpy as np
 
-from mapstream.operators.estimation.keys import rows_by_variable
+from mapstream.operators.estimation.keys import Variable, key_of, rows_by_variable
 from mapstream.operators.estimation.noise import Factor
 from mapstream.operators.estimation.states import Values
 from mapstream.streams.errors import EstimationError
 
 Name = bytes  # of a factor; the caller chooses it
-_WEAK_SIGMA = 1e3  # [rad, m, m/s]: what holds a variable that nothing determines
+_WEAK_SIGMA = 1e3  # [rad, m]: what holds a variable that nothing determines
+_WEAK_VELOCITY_MPS = 100.0
+_WEAK_BIAS = 1.0  # [m/s^2, rad/s]
 
 
 class IncrementalProblem:
@@ -37,6 +39,7 @@ class IncrementalProblem:
         self._is_precise = False  # Cholesky was not precise enough
         self._is_weak = False  # it was indeterminate as a whole, so each new variable gets a prior
         self._isam = _new_isam(is_precise=False)
+        self._sound = gtsam.Values()  # the newest solution that was one
 
     def __len__(self) -> int:
         return len(self._keys)
@@ -73,10 +76,11 @@ class IncrementalProblem:
         self._factors |= added
         try:
             result = self._isam.update(_graph_of(added.values()), values, gone)
+            self._indices.update(zip(added, result.getNewFactorsIndices(), strict=True))
+            self._require_finite()
         except RuntimeError:
             self._rebuild(values)
-        else:
-            self._indices.update(zip(added, result.getNewFactorsIndices(), strict=True))
+        self._sound = self.values()
 
     def settle(self, tolerance_m: float = 1e-5, most: int = 20) -> None:
         """Go on until no pose moves further than the tolerance: a loop takes several steps to sink in."""
@@ -110,6 +114,16 @@ class IncrementalProblem:
             self._start(values)
         except RuntimeError:
             self._rebuild(values)
+        self._sound = self.values()
+
+    def _require_finite(self) -> None:
+        """QR does not say that a problem is singular: it gives infinite steps.
+
+        Raises:
+            RuntimeError: If there is one.
+        """
+        if not np.isfinite(self._positions()).all():
+            raise RuntimeError("the solution is not finite")
 
     def _positions(self) -> Any:  # noqa: ANN401  # (N, 12) of all poses
         return gtsam.utilities.extractPose3(self.values())
@@ -119,11 +133,12 @@ class IncrementalProblem:
         result = isam.update(_graph_of(self._factors.values()), values)
         self._indices = dict(zip(self._factors, result.getNewFactorsIndices(), strict=True))
         self._isam = isam
+        self._require_finite()
 
     def _rebuild(self, added: Values) -> None:
         """Solve the whole, from where iSAM2 stood when it failed; with weak priors if it must be."""
         self.num_rebuilds += 1
-        start = gtsam.Values(self._isam.getLinearizationPoint())
+        start = gtsam.Values(self._sound)
         for key in start.keys():  # noqa: SIM118  # gtsam's values are no mapping
             if key not in self._keys or added.exists(key):
                 start.erase(key)
@@ -159,14 +174,27 @@ class IncrementalProblem:
 
     def _weak_priors(self, values: Values, keys: Iterable[int]) -> dict[Name, Factor]:
         """Return a prior on each of the variables, where it is, too weak to matter where anything else speaks."""
-        rows = rows_by_variable(keys)
-        poses = rows.get("pose", np.zeros(0, np.int64)).tolist()
+        priors: dict[Name, Factor] = {}
+        for variable, rows in rows_by_variable(keys).items():
+            for row in rows.tolist():
+                prior = _weak_prior(variable, key_of(variable, row), values)
+                if prior is not None:
+                    priors[b"weak%s%d" % (variable.encode(), row)] = prior
+        self.num_weak += len(priors)
+        return priors
+
+
+def _weak_prior(variable: Variable, key: int, values: Values) -> Factor | None:
+    if variable in ("pose", "frame", "extrinsics"):
         noise = gtsam.noiseModel.Isotropic.Sigma(6, _WEAK_SIGMA)
-        self.num_weak += len(poses)
-        return {
-            b"weak%d" % key: gtsam.PriorFactorPose3(key, values.atPose3(key), noise)
-            for key in poses
-        }
+        return gtsam.PriorFactorPose3(key, values.atPose3(key), noise)
+    if variable == "velocity":
+        noise = gtsam.noiseModel.Isotropic.Sigma(3, _WEAK_VELOCITY_MPS)
+        return gtsam.PriorFactorVector(key, values.atVector(key), noise)
+    if variable == "bias":
+        noise = gtsam.noiseModel.Isotropic.Sigma(6, _WEAK_BIAS)
+        return gtsam.PriorFactorConstantBias(key, values.atConstantBias(key), noise)
+    return None  # landmarks come with what measured them
 
 
 def _graph_of(factors: Iterable[Factor]) -> Any:  # noqa: ANN401
