@@ -93,8 +93,3 @@ def switchable(noise: Any, prior_weight: float) -> Any:  # noqa: ANN401
     """
     loss = gtsam.noiseModel.mEstimator.GemanMcClure.Create(float(np.sqrt(prior_weight)))
     return gtsam.noiseModel.Robust.Create(loss, noise)
-
-
-def switch_of(chi2: float, prior_weight: float) -> float:
-    """Return the switch (0 to 1) that belongs to a switchable constraint with this chi2."""
-    return prior_weight / (prior_weight + chi2)

@@ -130,7 +130,8 @@ def _spatial(problem: Problem, rows: IntArray, held: IntArray, poses: FloatArray
     """Return poses (N, 4, 4) by gtsam, which weighs all measurements alike."""
     alike = gtsam.noiseModel.Isotropic.Sigma(6, 1.0)  # it takes no other kind of noise
     factors = {**problem.plain, **problem.loops}
-    ties = [_held_poses(problem).get(key) or fixed(key, poses[key]) for key in held.tolist()]
+    known = _held_poses(problem)
+    ties = [known.get(key) or fixed(key, poses[key]) for key in held.tolist()]
     chosen = [*ties, *(factors[row] for row in rows.tolist())]
     graph = graph_of([factor.cloneWithNewNoiseModel(alike) for factor in chosen])
     values = gtsam.InitializePose3.initialize(graph)
