@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
@@ -27,11 +27,9 @@ from mapstream.graph.cli.running import execute
 from mapstream.graph.problems import did_you_mean
 from mapstream.graph.trajectory_sources import read_trajectory
 from mapstream.graph.unused_positions import unused_position_errors
-from mapstream.recordings.attached_rig import rig_of
 from mapstream.recordings.evaluation import Statistics
 from mapstream.recordings.maps import check_map, load_map
 from mapstream.streams.errors import ConfigError
-from mapstream.streams.sensors import ImuSensor
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -75,11 +73,12 @@ def _kitti00(folder: Path, seed: int) -> Path:  # noqa: ARG001  # it lies in the
     return converted("kitti00-gtsam", "gtsam")
 
 
-def _inertial_params(recording: Path) -> dict[str, str]:
-    """Return the noise of the IMU that the recording brings with it, and how few positions are used."""
-    imu = rig_of(recording).select("imu")
-    noise = asdict(imu.noise) if isinstance(imu, ImuSensor) and imu.noise is not None else {}
-    return {"position_period_s": "10"} | {name: repr(density) for name, density in noise.items()}
+def _inertial_params(recording: Path) -> dict[str, str]:  # noqa: ARG001  # as other demos ask it
+    """Return how few positions are used.
+
+    The noise stays that of the graph: with the densities of its data sheet the IMU outvotes the positions.
+    """
+    return {"position_period_s": "10"}
 
 
 DEMOS = {
