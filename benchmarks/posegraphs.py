@@ -16,10 +16,10 @@ import scipy.sparse.linalg
 import scipy.special  # noqa: F401  # both imported when first needed: not what is measured here
 
 from mapstream.operators.estimation.batch import OptimizeConfig, optimize_map
+from mapstream.operators.estimation.outliers.scores import read_labels, score_loops
 from mapstream.operators.estimation.problem import make_problem
 from mapstream.operators.estimation.report import OptimizationReport
-from mapstream.operators.estimation.scores import read_labels, score_loops
-from mapstream.operators.estimation.start import chordal_values
+from mapstream.operators.estimation.starts.start import chordal_values
 from mapstream.recordings.g2o import read_g2o
 from mapstream.recordings.maps.model import Map
 from mapstream.streams.messages.sensors import FloatArray

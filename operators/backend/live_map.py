@@ -11,24 +11,24 @@ from mapstream.operators.estimation.batch import (
     OptimizeConfig,
     optimize_map,
 )
-from mapstream.operators.estimation.first_fixes import (
+from mapstream.operators.estimation.factors.inertial import outdated
+from mapstream.operators.estimation.gauge import gauge_factors
+from mapstream.operators.estimation.incremental import IncrementalProblem
+from mapstream.operators.estimation.kinds import make_factors
+from mapstream.operators.estimation.noise import Factor, NoiseModels
+from mapstream.operators.estimation.priors import prior_factors
+from mapstream.operators.estimation.problem import with_loss
+from mapstream.operators.estimation.starts.first_fixes import (
     FirstFixes,
     headed,
     is_linked,
     without_false_fixes,
 )
-from mapstream.operators.estimation.gauge import gauge_factors
-from mapstream.operators.estimation.incremental import IncrementalProblem
-from mapstream.operators.estimation.inertial import outdated
-from mapstream.operators.estimation.inertial_start import (
+from mapstream.operators.estimation.starts.inertial_start import (
     dead_reckoned,
     first_velocity_prior,
     with_known_biases,
 )
-from mapstream.operators.estimation.kinds import make_factors
-from mapstream.operators.estimation.noise import Factor, NoiseModels
-from mapstream.operators.estimation.priors import prior_factors
-from mapstream.operators.estimation.problem import with_loss
 from mapstream.operators.estimation.states import initial_values, with_solution
 from mapstream.operators.estimation.symbols import PoseSymbols
 from mapstream.recordings.maps.build import add_edges, anchored

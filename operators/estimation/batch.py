@@ -13,12 +13,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from mapstream.operators.estimation.absolute_outliers import reject_absolute
 from mapstream.operators.estimation.determinacy import determined
-from mapstream.operators.estimation.inertial import outdated
-from mapstream.operators.estimation.landmark_starts import averaged_landmarks
+from mapstream.operators.estimation.factors.inertial import outdated
 from mapstream.operators.estimation.noise import Factor
 from mapstream.operators.estimation.optimize_config import OptimizeConfig
+from mapstream.operators.estimation.outliers.absolute_outliers import reject_absolute
+from mapstream.operators.estimation.outliers.robust import Descent, RobustSolution
 from mapstream.operators.estimation.problem import (
     Problem,
     describe_failure,
@@ -31,10 +31,10 @@ from mapstream.operators.estimation.report import (
     as_one,
     dropped_edges,
 )
-from mapstream.operators.estimation.robust import Descent, RobustSolution
 from mapstream.operators.estimation.solvers import Limits, Solver, dogleg, levenberg_marquardt
 from mapstream.operators.estimation.sparse_solver import sparse_levenberg_marquardt
-from mapstream.operators.estimation.start import chordal_values
+from mapstream.operators.estimation.starts.landmark_starts import averaged_landmarks
+from mapstream.operators.estimation.starts.start import chordal_values
 from mapstream.operators.estimation.states import Values, with_solution
 from mapstream.recordings.maps.model import Map
 from mapstream.recordings.maps.tables import BoolArray

@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING, Literal
 import gtsam
 import numpy as np
 
+from mapstream.operators.estimation.factors.landmarks import shape_of
 from mapstream.operators.estimation.fixing import fixes
 from mapstream.operators.estimation.keys import variable_of
-from mapstream.operators.estimation.landmarks import shape_of
 from mapstream.operators.estimation.noise import Factor
 from mapstream.operators.estimation.problem import Problem, describe_variable, graph_of
 from mapstream.streams.errors import EstimationError

@@ -8,10 +8,10 @@ from typing import Any, Literal
 import gtsam
 import numpy as np
 
+from mapstream.operators.estimation.factors.landmarks import shape_of
+from mapstream.operators.estimation.factors.own_factor import OwnFactor, Residual
 from mapstream.operators.estimation.keys import Variable, key_of, rows_by_variable, variable_of
-from mapstream.operators.estimation.landmarks import shape_of
 from mapstream.operators.estimation.noise import Factor
-from mapstream.operators.estimation.own_factor import OwnFactor, Residual
 from mapstream.recordings.maps.model import Map
 from mapstream.streams.messages.sensors import FloatArray
 

@@ -13,8 +13,14 @@ from importlib.metadata import entry_points
 
 import numpy as np
 
-from mapstream.operators.estimation import absolute, inertial, landmarks, relations, relative
-from mapstream.operators.estimation.edge_ends import edge_name
+from mapstream.operators.estimation.factors import (
+    absolute,
+    inertial,
+    landmarks,
+    relations,
+    relative,
+)
+from mapstream.operators.estimation.factors.edge_ends import edge_name
 from mapstream.operators.estimation.noise import Factor, NoiseModels
 from mapstream.recordings.maps.model import Map
 from mapstream.streams.errors import EstimationError

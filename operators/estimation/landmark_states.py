@@ -7,9 +7,9 @@ from typing import Any
 
 import gtsam
 
-from mapstream.operators.estimation import planes
+from mapstream.operators.estimation.factors import planes
+from mapstream.operators.estimation.factors.landmarks import shape_of
 from mapstream.operators.estimation.keys import key_of
-from mapstream.operators.estimation.landmarks import shape_of
 from mapstream.recordings.maps.model import Map
 from mapstream.streams.geometry import invert, quat_xyzw_from_rotation
 from mapstream.streams.messages.sensors import FloatArray, IntArray

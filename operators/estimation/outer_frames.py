@@ -7,8 +7,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from mapstream.operators.estimation.mounts import MountOf
-from mapstream.operators.estimation.payloads import payloads
+from mapstream.operators.estimation.factors.mounts import MountOf
+from mapstream.operators.estimation.factors.payloads import payloads
 from mapstream.recordings.maps.model import Map
 from mapstream.streams.messages.sensors import FloatArray, IntArray
 

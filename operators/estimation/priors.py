@@ -11,9 +11,9 @@ from collections.abc import Mapping
 import gtsam
 import numpy as np
 
-from mapstream.operators.estimation.inertial import parameters_of
+from mapstream.operators.estimation.factors.inertial import parameters_of
+from mapstream.operators.estimation.factors.mounts import mounts, place_prior
 from mapstream.operators.estimation.keys import key_of, rows_by_variable
-from mapstream.operators.estimation.mounts import mounts, place_prior
 from mapstream.operators.estimation.noise import Factor
 from mapstream.operators.estimation.outer_frames import starting_frames
 from mapstream.recordings.maps.model import Map

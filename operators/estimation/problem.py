@@ -11,13 +11,13 @@ from dataclasses import dataclass
 import gtsam
 import numpy as np
 
-from mapstream.operators.estimation.consistency import chi2_gate
 from mapstream.operators.estimation.fixing import fixed_keys, fixes, half_fixes
 from mapstream.operators.estimation.gauge import gauge_factors
 from mapstream.operators.estimation.keys import variable_of
 from mapstream.operators.estimation.kinds import make_factors, makers
 from mapstream.operators.estimation.noise import Factor, NoiseModels
 from mapstream.operators.estimation.optimize_config import Loss, OptimizeConfig
+from mapstream.operators.estimation.outliers.consistency import chi2_gate
 from mapstream.operators.estimation.priors import prior_factors
 from mapstream.operators.estimation.solvers import Graph
 from mapstream.operators.estimation.states import Values, initial_values

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import gtsam
 import numpy as np
 
-from mapstream.operators.estimation.consistency import adjoint
+from mapstream.operators.estimation.outliers.consistency import adjoint
 from mapstream.operators.estimation.solvers import Graph, Limits, Solved
 from mapstream.operators.estimation.states import Values
 from mapstream.recordings.maps.tables import BoolArray

@@ -12,10 +12,10 @@ from typing import Any
 import gtsam
 import numpy as np
 
+from mapstream.operators.estimation.factors.mounts import mounts, with_mounts
 from mapstream.operators.estimation.fixing import Fixable
 from mapstream.operators.estimation.keys import Variable, key_of, rows_by_variable
 from mapstream.operators.estimation.landmark_states import insert_landmarks, with_landmarks
-from mapstream.operators.estimation.mounts import mounts, with_mounts
 from mapstream.operators.estimation.outer_frames import starting_frames
 from mapstream.recordings.maps.model import Map
 from mapstream.streams.geometry import invert, straightened

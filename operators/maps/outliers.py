@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from pydantic import Field
 
-from mapstream.operators.estimation.consistency import chi2_gate, cycle_chi2
+from mapstream.operators.estimation.outliers.consistency import chi2_gate, cycle_chi2
 from mapstream.operators.operator import OperatorConfig
 from mapstream.recordings.maps.model import Map
 

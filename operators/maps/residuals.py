@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from mapstream.operators.estimation.consistency import mahalanobis
+from mapstream.operators.estimation.outliers.consistency import mahalanobis
 from mapstream.recordings.maps.edge_kinds import RELATIVE_KINDS
 from mapstream.recordings.maps.model import Map
 from mapstream.streams.geometry import invert, se3_log

@@ -136,7 +136,9 @@ class TrajectoryConfig(OperatorConfig):
         if twice:
             raise ValueError(f"two inputs are called {twice[0]}; give each a name of its own")
         if {"imu", "sources"} & set(self.mounts):
-            raise ValueError("a mount is called neither imu nor sources; the map keeps others there")
+            raise ValueError(
+                "a mount is called neither imu nor sources; the map keeps others there"
+            )
         return self
 
     def described(self, T_base_imu: SE3) -> str:

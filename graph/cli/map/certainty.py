@@ -11,12 +11,12 @@ import typer
 from mapstream.graph.cli.map.choosing import MissionOption
 from mapstream.graph.cli.options import KeySetList, config_from
 from mapstream.graph.cli.output import JsonFlag, in_place, say, say_json, say_table
-from mapstream.operators.estimation.absolute_outliers import (
+from mapstream.operators.estimation.outliers.absolute_outliers import (
     RejectAbsoluteConfig,
     RejectAbsoluteReport,
     reject_absolute,
 )
-from mapstream.operators.estimation.alignment import AlignConfig, align_missions
+from mapstream.operators.estimation.outliers.alignment import AlignConfig, align_missions
 from mapstream.operators.maps.missions import find_mission
 from mapstream.operators.maps.outliers import RejectLoopsConfig, RejectLoopsReport, reject_loops
 from mapstream.recordings.maps import Map, load_map, require_valid

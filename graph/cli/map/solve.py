@@ -41,7 +41,7 @@ def optimize(
         OptimizeConfig,
         optimize_map,
     )
-    from mapstream.operators.estimation.scores import read_labels, score_loops  # noqa: PLC0415
+    from mapstream.operators.estimation.outliers.scores import read_labels, score_loops  # noqa: PLC0415
 
     folder: Path = context.obj
     config = config_from(OptimizeConfig, set_)

@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mapstream.operators.estimation.absolute_outliers import reject_absolute
 from mapstream.operators.estimation.batch import OptimizeConfig, optimize_map
+from mapstream.operators.estimation.outliers.absolute_outliers import reject_absolute
 from mapstream.recordings.maps.build import append_edges
 from mapstream.recordings.maps.model import Map
 from mapstream.recordings.maps.tables import BoolArray, Edges

@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mapstream.operators.estimation.alignment import AlignConfig, align_missions
 from mapstream.operators.estimation.batch import optimize_map
+from mapstream.operators.estimation.outliers.alignment import AlignConfig, align_missions
 from mapstream.recordings.g2o import read_g2o
 from mapstream.recordings.kimera_multi import read_kimera_multi
 from mapstream.recordings.maps.build import append_edges

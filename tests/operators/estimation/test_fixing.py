@@ -13,8 +13,8 @@ from typing import get_args
 import numpy as np
 import pytest
 
-from mapstream.operators.estimation import planes
 from mapstream.operators.estimation.batch import OptimizeConfig, optimize_map
+from mapstream.operators.estimation.factors import planes
 from mapstream.operators.estimation.fixing import Fixable
 from mapstream.operators.estimation.kinds import make_factors, makers, register
 from mapstream.operators.estimation.noise import NoiseModels

@@ -13,8 +13,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mapstream.operators.estimation.batch import optimize_map
+from mapstream.operators.estimation.factors.inertial import Bias, Samples, outdated, preintegrated
 from mapstream.operators.estimation.fixing import fixed_keys
-from mapstream.operators.estimation.inertial import Bias, Samples, outdated, preintegrated
 from mapstream.operators.estimation.kinds import make_factors
 from mapstream.operators.estimation.noise import NoiseModels
 from mapstream.operators.estimation.states import initial_values, velocities_of_poses, with_solution

@@ -7,11 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mapstream.operators.estimation import planes
 from mapstream.operators.estimation.batch import OptimizeConfig, optimize_map
+from mapstream.operators.estimation.factors import planes
 from mapstream.operators.estimation.kinds import make_factors
-from mapstream.operators.estimation.landmark_starts import averaged_landmarks
 from mapstream.operators.estimation.noise import NoiseModels
+from mapstream.operators.estimation.starts.landmark_starts import averaged_landmarks
 from mapstream.recordings.maps.model import Map
 from mapstream.recordings.maps.tables import Observations
 from mapstream.streams.errors import EstimationError

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from mapstream.operators.estimation.batch import OptimizeConfig, optimize_map
-from mapstream.operators.estimation.consistency import cycle_chi2
-from mapstream.operators.estimation.scores import read_labels, score_loops
+from mapstream.operators.estimation.outliers.consistency import cycle_chi2
+from mapstream.operators.estimation.outliers.scores import read_labels, score_loops
 from mapstream.recordings.g2o import read_g2o
 from mapstream.recordings.maps.build import add_edges
 from mapstream.recordings.maps.model import Map

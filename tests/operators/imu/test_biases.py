@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from mapstream.operators.estimation.inertial import Bias
+from mapstream.operators.estimation.factors.inertial import Bias
 from mapstream.operators.imu.biases import ImuBiases, ImuBiasesConfig
 from mapstream.operators.operator import Context
 from mapstream.operators.testing import run_operator

@@ -6,7 +6,7 @@ import json
 
 import numpy as np
 
-from mapstream.operators.estimation.inertial import parameters_of
+from mapstream.operators.estimation.factors.inertial import parameters_of
 from mapstream.operators.imu.parameters import ImuParameters
 from mapstream.operators.trajectory.config import TrajectoryConfig
 from mapstream.streams.geometry import SE3

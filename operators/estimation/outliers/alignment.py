@@ -13,7 +13,7 @@ from itertools import combinations
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, PositiveInt
 
-from mapstream.operators.estimation.consistency import (
+from mapstream.operators.estimation.outliers.consistency import (
     OdometryChain,
     chi2_gate,
     in_frame,

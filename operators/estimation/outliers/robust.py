@@ -15,8 +15,8 @@ from dataclasses import dataclass, replace
 import gtsam
 import numpy as np
 
-from mapstream.operators.estimation.consistency import chi2_gate, cycle_chi2
 from mapstream.operators.estimation.noise import Factor, switchable
+from mapstream.operators.estimation.outliers.consistency import chi2_gate, cycle_chi2
 from mapstream.operators.estimation.problem import Problem, chi2_of, dimensions
 from mapstream.operators.estimation.solvers import Graph, Limits, Solved, Solver
 from mapstream.operators.estimation.states import Values

@@ -14,8 +14,8 @@ from typing import Any
 
 import numpy as np
 
+from mapstream.operators.estimation.factors.payloads import Payload, T_base_sensor_of
 from mapstream.operators.estimation.keys import key_of
-from mapstream.operators.estimation.payloads import Payload, T_base_sensor_of
 from mapstream.recordings.maps.model import Map
 from mapstream.streams.errors import EstimationError
 from mapstream.streams.geometry import SE3

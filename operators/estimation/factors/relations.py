@@ -11,11 +11,11 @@ from typing import Any
 
 import numpy as np
 
-from mapstream.operators.estimation.edge_ends import edge_name, require_ends
+from mapstream.operators.estimation.factors.edge_ends import edge_name, require_ends
+from mapstream.operators.estimation.factors.landmarks import shape_of
+from mapstream.operators.estimation.factors.own_factor import OwnFactor, Residual
 from mapstream.operators.estimation.keys import key_of
-from mapstream.operators.estimation.landmarks import shape_of
 from mapstream.operators.estimation.noise import Factor, NoiseModels
-from mapstream.operators.estimation.own_factor import OwnFactor, Residual
 from mapstream.recordings.maps.model import Map
 from mapstream.streams.errors import EstimationError
 from mapstream.streams.geometry import hat

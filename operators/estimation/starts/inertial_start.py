@@ -13,7 +13,7 @@ from itertools import pairwise
 import gtsam
 import numpy as np
 
-from mapstream.operators.estimation.inertial import bias_of
+from mapstream.operators.estimation.factors.inertial import bias_of
 from mapstream.operators.estimation.keys import key_of
 from mapstream.operators.estimation.noise import Factor
 from mapstream.recordings.maps.model import Map

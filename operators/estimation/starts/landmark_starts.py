@@ -10,8 +10,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from mapstream.operators.estimation.landmarks import shape_of
-from mapstream.operators.estimation.mounts import mounts
+from mapstream.operators.estimation.factors.landmarks import shape_of
+from mapstream.operators.estimation.factors.mounts import mounts
 from mapstream.recordings.maps.model import Map
 from mapstream.streams.geometry import invert
 from mapstream.streams.messages.sensors import FloatArray, IntArray

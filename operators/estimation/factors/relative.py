@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import gtsam
 
-from mapstream.operators.estimation.edge_ends import require_ends
+from mapstream.operators.estimation.factors.edge_ends import require_ends
 from mapstream.operators.estimation.noise import Factor, NoiseModels
 from mapstream.recordings.maps.model import Map
 from mapstream.streams.messages.sensors import IntArray

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from mapstream.operators.estimation.edge_ends import edge_name
+from mapstream.operators.estimation.factors.edge_ends import edge_name
 from mapstream.recordings.maps.model import Map
 from mapstream.streams.errors import EstimationError
 from mapstream.streams.geometry import SE3

@@ -12,13 +12,13 @@ from typing import Any, Literal
 import gtsam
 import numpy as np
 
-from mapstream.operators.estimation import planes
-from mapstream.operators.estimation.edge_ends import require_ends
+from mapstream.operators.estimation.factors import planes
+from mapstream.operators.estimation.factors.edge_ends import require_ends
+from mapstream.operators.estimation.factors.mounts import MountOf
+from mapstream.operators.estimation.factors.own_factor import OwnFactor
+from mapstream.operators.estimation.factors.payloads import number_of, payloads
 from mapstream.operators.estimation.keys import key_of
-from mapstream.operators.estimation.mounts import MountOf
 from mapstream.operators.estimation.noise import Factor, NoiseModels
-from mapstream.operators.estimation.own_factor import OwnFactor
-from mapstream.operators.estimation.payloads import number_of, payloads
 from mapstream.recordings.maps.model import Map
 from mapstream.streams.messages.sensors import FloatArray, IntArray
 

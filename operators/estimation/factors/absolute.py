@@ -13,13 +13,13 @@ from typing import Any
 import gtsam
 import numpy as np
 
-from mapstream.operators.estimation.edge_ends import edge_name, require_ends
+from mapstream.operators.estimation.factors.edge_ends import edge_name, require_ends
+from mapstream.operators.estimation.factors.landmarks import Shape, shape_of
+from mapstream.operators.estimation.factors.mounts import MountOf
+from mapstream.operators.estimation.factors.own_factor import OwnFactor, Residual
+from mapstream.operators.estimation.factors.payloads import number_of, payloads
 from mapstream.operators.estimation.keys import key_of
-from mapstream.operators.estimation.landmarks import Shape, shape_of
-from mapstream.operators.estimation.mounts import MountOf
 from mapstream.operators.estimation.noise import Factor, NoiseModels
-from mapstream.operators.estimation.own_factor import OwnFactor, Residual
-from mapstream.operators.estimation.payloads import number_of, payloads
 from mapstream.recordings.maps.model import Map
 from mapstream.streams.errors import EstimationError
 from mapstream.streams.geometry import SE3

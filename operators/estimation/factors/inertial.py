@@ -14,11 +14,11 @@ from typing import Any
 import gtsam
 import numpy as np
 
-from mapstream.operators.estimation.edge_ends import edge_name, require_ends
+from mapstream.operators.estimation.factors.edge_ends import edge_name, require_ends
+from mapstream.operators.estimation.factors.mounts import sensors_of
+from mapstream.operators.estimation.factors.payloads import pose_from_numbers
 from mapstream.operators.estimation.keys import key_of
-from mapstream.operators.estimation.mounts import sensors_of
 from mapstream.operators.estimation.noise import Factor, NoiseModels
-from mapstream.operators.estimation.payloads import pose_from_numbers
 from mapstream.operators.imu.parameters import ImuParameters
 from mapstream.recordings.maps.model import Map
 from mapstream.streams.errors import EstimationError

@@ -9,11 +9,11 @@ import gtsam
 import numpy as np
 
 from mapstream.operators.estimation.gauge import gauge_factors
-from mapstream.operators.estimation.inertial_start import first_velocity_prior, headings
 from mapstream.operators.estimation.kinds import make_factors
 from mapstream.operators.estimation.noise import Factor, NoiseModels
 from mapstream.operators.estimation.priors import prior_factors
 from mapstream.operators.estimation.problem import graph_of
+from mapstream.operators.estimation.starts.inertial_start import first_velocity_prior, headings
 from mapstream.operators.estimation.states import initial_values, with_solution
 from mapstream.recordings.maps.model import Map
 from mapstream.streams.errors import EstimationError

@@ -1,0 +1,1 @@
+"""What an edge of each kind says, as a factor of the problem."""

@@ -1,0 +1,1 @@
+"""Where the variables begin: a problem that begins badly ends badly."""
