@@ -29,6 +29,7 @@ VERBS = {  # verb -> function or group of commands, and what a list of verbs say
     "convert": ("convert:convert", "Convert data sets and bags to MCAP."),
     "simulate": ("simulate:simulate", "Make a synthetic recording with its truth inside."),
     "map": ("map:app", "Import, export, check, edit, merge or optimise a map."),
+    "batch": ("batch:batch", "Run map commands from a file, one after another."),
     "eval": ("evaluate:evaluate", "Compare a trajectory or map with a reference."),
     "check-plugin": ("plugins:check_plugin", "Check the operators of another package."),
 }
