@@ -15,6 +15,9 @@ from mapstream.recordings.maps.model import Map
 from mapstream.streams.errors import EstimationError
 
 _MOST = 1.25  # standard deviations: poses that only noise moved stay below 1, whatever their number
+_MOST_IF_SWITCHED = (
+    2.5  # where false loops could be switched off: noise of real odometry is often understated
+)
 _GROWTH = 1.5  # times what it was: covariances of some maps are too small to begin with
 
 
@@ -43,15 +46,24 @@ def map_quality(map_: Map) -> Quality:
     )
 
 
-def require_no_worse(before: Map, after: Map) -> None:
+def require_no_worse(before: Map, after: Map, *, may_switch: bool = True) -> None:
     """Refuse a solution that bends a mission far beyond the noise of its own motion.
 
+    Args:
+        before: The map that was solved.
+        after: The solution.
+        may_switch: Whether the solver was free to switch false loops off.
+
     Raises:
-        EstimationError: If a mission is strained by more than 1.25 sigma, and half more than before.
+        EstimationError: If a mission is strained by more than 1.25 sigma (2.5 where every loop could be
+            switched off), and half more than before.
     """
+    loops = after.edges.kind == "loop"
+    was_free = may_switch and bool(after.edges.is_switchable[loops].all())
+    most = _MOST_IF_SWITCHED if was_free else _MOST
     was = map_quality(before).strain
     for mission_id, strain in map_quality(after).strain.items():
-        if strain > max(_MOST, _GROWTH * was.get(mission_id, 0.0)):
+        if strain > max(most, _GROWTH * was.get(mission_id, 0.0)):
             raise EstimationError(
                 f"the map got worse and stays as it was: mission {mission_id}'s own motion now contradicts"
                 f" its poses by {strain:.2f} sigma (rms), {was.get(mission_id, 0.0):.2f} before; let solvers"

@@ -46,7 +46,7 @@ def optimize(
     folder: Path = context.obj
     config = config_from(OptimizeConfig, set_)
     settings = config.model_dump(mode="json", exclude_defaults=True)
-    tool = _guarded(lambda map_: optimize_map(map_, config), keep=keep)
+    tool = _guarded(lambda map_: optimize_map(map_, config), keep=keep, may_switch=config.is_robust)
     is_false = read_labels(labels) if labels is not None else None
     report = change_map(folder, "optimize", tool, **settings)
     score = score_loops(load_map(folder), is_false) if is_false is not None else None
@@ -93,7 +93,9 @@ def relax(  # noqa: PLR0913  # one for each option of the command
 
     settings = config.model_dump(mode="json", exclude_defaults=True)
     settings |= {"mission": mission, "each": each or None, "loops": loops.name if loops else None}
-    report = change_map(folder, "relax", _guarded(relaxed, keep=keep), **settings)
+    report = change_map(
+        folder, "relax", _guarded(relaxed, keep=keep, may_switch=config.is_robust), **settings
+    )
     if json:
         say_json(report)
         return
@@ -106,14 +108,14 @@ def relax(  # noqa: PLR0913  # one for each option of the command
 
 
 def _guarded(
-    tool: Callable[[Map], tuple[Map, ReportT]], *, keep: bool
+    tool: Callable[[Map], tuple[Map, ReportT]], *, keep: bool, may_switch: bool
 ) -> Callable[[Map], tuple[Map, ReportT]]:
     """Return the tool that refuses a solution which odometry contradicts, unless it is kept all the same."""
 
     def guarded(map_: Map) -> tuple[Map, ReportT]:
         solved, report = tool(map_)
         if not keep:
-            require_no_worse(map_, solved)
+            require_no_worse(map_, solved, may_switch=may_switch)
         return solved, report
 
     return guarded
