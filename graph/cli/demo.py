@@ -74,10 +74,7 @@ def _kitti00(folder: Path, seed: int) -> Path:  # noqa: ARG001  # it lies in the
 
 
 def _inertial_params(recording: Path) -> dict[str, str]:  # noqa: ARG001  # as other demos ask it
-    """Return how few positions are used.
-
-    The noise stays that of the graph: with the densities of its data sheet the IMU outvotes the positions.
-    """
+    """Return how few positions are used; the others judge the map."""
     return {"position_period_s": "10"}
 
 
@@ -101,7 +98,7 @@ DEMOS = {
 def demo(
     name: Annotated[
         str, typer.Argument(help="; ".join(f"{n}: {d.summary}" for n, d in DEMOS.items()) + ".")
-    ] = "corridor",
+    ] = "kitti00",
     *,
     out: Annotated[
         Path | None, typer.Option("--out", help="A folder for the results; a new one without.")

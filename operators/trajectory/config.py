@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt, model_validator
 
 from mapstream.operators.imu.parameters import ImuParameters, ImuQuality
-from mapstream.operators.operator import OperatorConfig
+from mapstream.operators.operator import OperatorConfig, OptionalPath
 from mapstream.operators.trajectory.sources import AXES, AxisSigmas
 from mapstream.streams.geometry import SE3
 
@@ -64,13 +64,19 @@ class StillConfig(AxesConfig):
 class ImuConfig(ImuQuality):
     """Noise and limits of the IMU, as the map keeps them; where it sits is taken from its samples."""
 
+    rig: OptionalPath = None
+    """A sensor file: what its IMU says of noise, limits and gravity counts where nothing is said here."""
+    recording: OptionalPath = None
+    """Without `rig`, the sensor file that is attached to this recording, if one is."""
+    sensor_id: str | None = None
+    """Which IMU of several in the sensor file."""
     max_gap_s: PositiveFloat = 0.2
     """Samples further apart are not integrated."""
 
     def described(self, T_base_sensor: SE3) -> dict[str, object]:
         """Return what a mission's sensor set says of the IMU."""
         place = (*T_base_sensor.t.tolist(), *T_base_sensor.quat_xyzw.tolist())
-        quality = self.model_dump(exclude={"max_gap_s"})
+        quality = self.model_dump(include=set(ImuQuality.model_fields))
         return ImuParameters(**quality, T_base_sensor=place).description()
 
 
@@ -89,7 +95,7 @@ class ConstraintsConfig(OperatorConfig):
     """An input that gets `Constraint`."""
 
     period_s: NonNegativeFloat = 0.0
-    """At most one measurement in so long is used; 0: all are."""
+    """The first measurement in each stretch of so long is used; 0: all are."""
 
 
 SourceConfig = Annotated[OdometryConfig | WheelConfig | StillConfig, Field(discriminator="kind")]

@@ -5,30 +5,23 @@ Source: Trevor, Rogers, Christensen: OmniMapper, ICRA 2014, section III-C.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
 import anyio
-import numpy as np
 
-from mapstream.operators.odometry.uncertainty import diagonal
 from mapstream.operators.operator import DynamicPorts, Operator, Ports, report_loss
+from mapstream.operators.trajectory.assembly import (
+    bridge_of,
+    imu_source_of,
+    source_of,
+    trigger_of,
+)
 from mapstream.operators.trajectory.builder import TrajectoryBuilder
-from mapstream.operators.trajectory.config import (
-    OdometryConfig,
-    SourceConfig,
-    TrajectoryConfig,
-    WheelConfig,
-)
-from mapstream.operators.trajectory.imu_source import ImuSource
+from mapstream.operators.trajectory.config import TrajectoryConfig
 from mapstream.operators.trajectory.links import Links
-from mapstream.operators.trajectory.motion_models import (
-    ConstantVelocity,
-    MotionModel,
-    StandingStill,
-)
-from mapstream.operators.trajectory.sources import OdometrySource, PoseSource, WheelSource
+from mapstream.operators.trajectory.rig_imu import with_rig
+from mapstream.operators.trajectory.sources import OdometrySource, WheelSource
 from mapstream.recordings.maps.ids import mission_id
 from mapstream.streams.channel import Receiver, Sender
 from mapstream.streams.errors import EstimationError
@@ -59,16 +52,17 @@ class Trajectory(DynamicPorts, Operator[Ports, Outputs]):
     """
 
     def __init__(self, config: TrajectoryConfig) -> None:
-        self._config = config
+        self._config = config = with_rig(config)
         window_s = config.window_s or 0.0
         memory_s = 2 * config.late_s + window_s + config.submap_s + 10.0
-        self._keep_ns = END if config.window_s is None else round(memory_s * _SECOND_NS)
-        self._sources = {name: self._source(each) for name, each in config.sources.items()}
-        self._imu = self._imu_source()
-        self._trigger = _Trigger(config)
+        keep_ns = END if config.window_s is None else round(memory_s * _SECOND_NS)
+        self._sources = {name: source_of(each, keep_ns) for name, each in config.sources.items()}
+        self._imu = None if config.imu is None else imu_source_of(config.imu, keep_ns)
+        self._trigger = trigger_of(config)
+        self._T_odom_base = SE3.identity()  # the newest pose that the trigger was told
         self._builder: TrajectoryBuilder | None = None
         self._now_ns = -END
-        self._used_ns: dict[str, int] = {}  # by input of measurements: the newest that was used
+        self._due_ns: dict[str, int] = {}  # by input of measurements: when its next period begins
         self._begun_ns: int | None = None  # the stamp at which the next submap begins
 
     @classmethod
@@ -145,16 +139,23 @@ class Trajectory(DynamicPorts, Operator[Ports, Outputs]):
         if self._config.waits or not isinstance(message, Constraint):
             self._now_ns = max(self._now_ns, message.stamp_ns)
         if port == self._pace and not isinstance(message, PointCloud):
-            pose = getattr(message, "T_odom_base", None)
-            if self._trigger.fires(message.stamp_ns, pose):
+            if isinstance(message, Odometry | WheelOdometry):
+                self._T_odom_base = message.T_odom_base
+            if self._trigger.fires(message.stamp_ns, self._T_odom_base):
                 self.builder.ask(message.stamp_ns)
 
     def _is_due(self, port: str, stamp_ns: int) -> bool:
-        """Return whether enough time passed since the input's last measurement that was used."""
+        """Return whether this is the input's first measurement in its period; periods follow each other.
+
+        So there is one measurement in a period on average, whatever their rate.
+        """
         period_ns = round(self._config.constraints[port].period_s * _SECOND_NS)
-        if period_ns and stamp_ns < self._used_ns.get(port, -END) + period_ns:
+        if not period_ns:
+            return True
+        due_ns = self._due_ns.get(port, stamp_ns)
+        if stamp_ns < due_ns:
             return False
-        self._used_ns[port] = stamp_ns
+        self._due_ns[port] = stamp_ns + period_ns - (stamp_ns - due_ns) % period_ns
         return True
 
     def due(self, known_ns: int | None = None) -> list[Submap]:
@@ -195,9 +196,9 @@ class Trajectory(DynamicPorts, Operator[Ports, Outputs]):
 
     def _see(self, cloud: PointCloud) -> None:
         first = next(iter(self._sources.values()), None)
-        is_known = first is not None and first.covers(cloud.stamp_ns, cloud.stamp_ns)
-        pose = first.state_at(cloud.stamp_ns).T_odom_base if first and is_known else None
-        if self._trigger.fires(cloud.stamp_ns, pose):
+        if first is not None and first.covers(cloud.stamp_ns, cloud.stamp_ns):
+            self._T_odom_base = first.state_at(cloud.stamp_ns).T_odom_base
+        if self._trigger.fires(cloud.stamp_ns, self._T_odom_base):
             self.builder.see(cloud)
 
     def _add(self, port: str, message: Message) -> bool:
@@ -219,65 +220,7 @@ class Trajectory(DynamicPorts, Operator[Ports, Outputs]):
             name = mission_id(f"{self._config.mission}@{stamp_ns}", epoch)
             window_s = self._config.window_s
             self._builder = TrajectoryBuilder(
-                Links(name, self._sources, self._imu, self._bridge()),
+                Links(name, self._sources, self._imu, bridge_of(self._config, self._sources)),
                 window_ns=None if window_s is None else round(window_s * _SECOND_NS),
                 keep_ns=round(self._config.late_s * _SECOND_NS),
             )
-
-    def _source(self, config: SourceConfig) -> PoseSource:
-        if isinstance(config, OdometryConfig):
-            step = diagonal(config.sigma_rad, config.sigma_m)
-            gap_ns = round(config.max_gap_s * _SECOND_NS)
-            return OdometrySource(step, keep_ns=self._keep_ns, max_gap_ns=gap_ns)
-        if isinstance(config, WheelConfig):
-            return WheelSource(
-                config.sigmas(),
-                turn_m_per_rad=config.turn_m_per_rad,
-                keep_ns=self._keep_ns,
-                max_gap_ns=round(config.max_gap_s * _SECOND_NS),
-            )
-        return StandingStill(config.sigmas())
-
-    def _imu_source(self) -> ImuSource | None:
-        config = self._config.imu
-        if config is None:
-            return None
-        gap_ns = round(config.max_gap_s * _SECOND_NS)
-        return ImuSource(gravity_mps2=config.gravity_mps2, keep_ns=self._keep_ns, max_gap_ns=gap_ns)
-
-    def _bridge(self) -> MotionModel | None:
-        models: dict[str, Callable[[], MotionModel | None]] = {
-            "none": lambda: None,
-            "still": StandingStill,
-            "constant_velocity": lambda: ConstantVelocity(list(self._sources.values())),
-        }
-        return models[self._config.bridge]()
-
-
-class _Trigger:
-    """Fires at the first pose, and then after enough time, way or turn; it does not know of measurements."""
-
-    def __init__(self, config: TrajectoryConfig) -> None:
-        self._config = config
-        self._fired_ns: int | None = None
-        self._T_odom_fired: SE3 | None = None
-
-    def fires(self, stamp_ns: int, T_odom_base: SE3 | None) -> bool:
-        """Return whether a pose is due; without a pose only time counts."""
-        if self._fired_ns is not None and not self._is_due(stamp_ns, T_odom_base):
-            return False
-        self._fired_ns, self._T_odom_fired = stamp_ns, T_odom_base
-        return True
-
-    def _is_due(self, stamp_ns: int, T_odom_base: SE3 | None) -> bool:
-        config = self._config
-        elapsed_s = (stamp_ns - (self._fired_ns or 0)) / _SECOND_NS
-        if config.period_s is not None and elapsed_s >= config.period_s:
-            return True
-        if T_odom_base is None or self._T_odom_fired is None:
-            return False
-        step = self._T_odom_fired.inverse() @ T_odom_base
-        is_far = config.distance_m is not None and np.linalg.norm(step.t) >= config.distance_m
-        return bool(
-            is_far or (config.rotation_rad is not None and step.angle_rad >= config.rotation_rad)
-        )
