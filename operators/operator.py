@@ -18,11 +18,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from time import monotonic_ns as _monotonic_ns
 from time import thread_time_ns
-from typing import Any, ClassVar, Generic, Literal, TypeVar
+from typing import Annotated, Any, ClassVar, Generic, Literal, TypeVar
 
 import anyio
 import anyio.to_thread
-from pydantic import BaseModel, ConfigDict
+from pydantic import BaseModel, BeforeValidator, ConfigDict
 
 from mapstream.operators.durations import Durations
 from mapstream.streams.channel import Receiver
@@ -35,6 +35,8 @@ M = TypeVar("M", bound=Message)
 R = TypeVar("R")
 
 Placement = Literal["inline", "thread", "process"]
+# of a config; the empty text, with which a parameter of a graph says that there is none, is no path
+OptionalPath = Annotated[Path | None, BeforeValidator(lambda given: None if given == "" else given)]
 
 
 class OperatorConfig(BaseModel):

@@ -64,6 +64,7 @@ class ContinuousSource:
         self._twists: list[
             FloatArray | None
         ] = []  # (6,) of the step to each message, when asked for
+        self._between: dict[int, SE3] = {}  # interpolated poses, until the next message
 
     def __len__(self) -> int:
         return len(self._stamps_ns)
@@ -86,6 +87,7 @@ class ContinuousSource:
         self._stamps_ns.append(odometry.stamp_ns)
         self._messages.append(odometry)
         self._twists.append(None)
+        self._between.clear()
         num_old = bisect_right(self._stamps_ns, odometry.stamp_ns - self._keep_ns) - 1
         if num_old > 0:
             del self._stamps_ns[:num_old], self._messages[:num_old], self._twists[:num_old]
@@ -94,6 +96,7 @@ class ContinuousSource:
         self._stamps_ns.clear()
         self._messages.clear()
         self._twists.clear()
+        self._between.clear()
 
     def measures(self, start_ns: int, end_ns: int) -> bool:
         """Return whether messages without a gap enclose the interval: nothing need be predicted."""
@@ -177,7 +180,10 @@ class ContinuousSource:
         T_before = self._messages[after - 1].T_odom_base
         if stamp_ns == start_ns:
             return T_before
-        return T_before @ SE3.exp((stamp_ns - start_ns) / (end_ns - start_ns) * self._twist(after))
+        if stamp_ns not in self._between:
+            step = (stamp_ns - start_ns) / (end_ns - start_ns) * self._twist(after)
+            self._between[stamp_ns] = T_before @ SE3.exp(step)
+        return self._between[stamp_ns]
 
     def state_at(self, stamp_ns: int) -> Odometry:
         """Return the message at a stamp: its pose interpolated, velocity and biases of the nearest message.

@@ -7,7 +7,7 @@ from typing import Any, Literal
 
 from pydantic import Field, NonNegativeFloat, PositiveFloat, field_validator
 
-from mapstream.operators.operator import OperatorConfig
+from mapstream.operators.operator import OperatorConfig, OptionalPath
 from mapstream.recordings.message_codec import known_messages
 from mapstream.streams.calibration import CameraCalibration
 from mapstream.streams.messages.constraints import Constraint, LoopClosure
@@ -72,7 +72,7 @@ class McapSourceConfig(OperatorConfig):
     topics: dict[str, str | TopicConfig] = Field(
         description="port: topic, or port: {topic, type, offset_s, stamp, frame}"
     )
-    rig: Path | None = Field(
+    rig: OptionalPath = Field(
         default=None,
         description="a sensor file: places, frames, time offsets; the one in the recording, if it has one",
     )

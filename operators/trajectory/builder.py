@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from bisect import bisect_left, insort
 from collections import Counter
-from itertools import takewhile
 
 import numpy as np
 
@@ -93,8 +92,11 @@ class TrajectoryBuilder:
         stamps_ns = self._window.waited(known_ns)
         begins = self._links.imu is not None and not self._out
         ahead_ns = LEVELLING_NS if begins else 0
-        decided = (self._links.is_decided(s + ahead_ns, known_ns) for s in stamps_ns)
-        return [stamp_ns for stamp_ns, _ in zip(stamps_ns, takewhile(bool, decided), strict=False)]
+
+        def is_open(stamp_ns: int) -> int:
+            return not self._links.is_decided(stamp_ns + ahead_ns, known_ns)
+
+        return stamps_ns[: bisect_left(stamps_ns, 1, key=is_open)]  # behind an open one all are
 
     def commit(self, known_ns: int, *, up_to_ns: int = END) -> Submap | None:
         """Put out what is ready, up to a stamp, and what came late; None if that is nothing.
