@@ -28,8 +28,9 @@ class GyroWindow:
         return list(self._batches)
 
     def forget(self, before_ns: int) -> None:
-        """Drop the batches that end before a time."""
-        self._batches = [b for b in self._batches if b.stamp_ns >= before_ns]
+        """Drop what is not needed from a time on; the last sample before it is, as motion begins there."""
+        num_before = sum(batch.stamp_ns <= before_ns for batch in self._batches)
+        self._batches = self._batches[max(0, num_before - 1) :]
 
 
 def turning(

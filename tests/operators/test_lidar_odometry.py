@@ -226,6 +226,24 @@ async def test_gyroscope_and_constant_velocity_agree_on_a_steady_turn() -> None:
     assert np.linalg.norm(error) < 0.05
 
 
+async def test_motion_that_begins_between_two_batches_is_covered() -> None:
+    """Scans end after the last sample of one batch, and before the first of the next."""
+    scans, _ = drive(4)
+    imu = [
+        ImuBatch(
+            stamps_ns=start_ns + 2_000_000 + np.arange(20) * 5_000_000,
+            gyro_radps=np.tile([0, 0, 0.3], (20, 1)),
+            accel_mps2=np.zeros((20, 3)),
+        )
+        for start_ns in range(scans[0].stamp_ns - 2 * 10**8, scans[-1].end_ns + 1, 10**8)
+    ]
+    context = Context()
+
+    await run_operator(gicp(), scans=scans, imu=imu, run_context=context)
+
+    assert not context.activity.warnings
+
+
 @pytest.mark.slow
 @MAKERS
 async def test_indoor_at_2_hz_where_the_sensor_turns_by_23_degrees_between_scans(
