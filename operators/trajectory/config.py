@@ -107,7 +107,7 @@ class TrajectoryConfig(OperatorConfig):
     sources: dict[str, SourceConfig] = Field(default_factory=dict)
     """Sources of motion by name; the first that knows an interval gives the first guess."""
     imu: ImuConfig | None = None
-    """With an IMU: an input `imu`, and its noise."""
+    """With an IMU: an input `imu`, and its noise, which the sensor file `rig` gives, or that of `recording`."""
     constraints: dict[str, ConstraintsConfig] = Field(default_factory=dict)
     """Inputs of measurements on poses, by name."""
     mounts: dict[str, MountConfig] = Field(default_factory=dict)
