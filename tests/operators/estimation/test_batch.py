@@ -9,26 +9,14 @@ from mapstream.operators.estimation.batch import optimize_map
 from mapstream.recordings.g2o import read_g2o
 from mapstream.recordings.maps.build import add_edges
 from mapstream.recordings.maps.check import check_map
-from mapstream.recordings.maps.model import Map
-from mapstream.recordings.maps.submaps import append_submap
-from mapstream.streams.geometry import SE3
 from tests.data import shared
 from tests.operators.estimation import worlds
 
 NUM, LAP = 120, 60
 
 
-def drive(seed: int) -> tuple[Map, list[SE3], np.random.Generator]:
-    rng = np.random.default_rng(seed)
-    truth = worlds.circle(NUM)
-    map_ = Map.empty()
-    for submap in worlds.submaps(truth, rng):
-        map_ = append_submap(map_, submap)
-    return map_, truth, rng
-
-
 def test_K1_a_loop_moves_the_past() -> None:
-    map_, truth, rng = drive(1)
+    map_, truth, rng = worlds.drive(NUM, 1)
     before = worlds.rmse_m(map_.vertices.T_mission_base, truth)
 
     closed, report = optimize_map(add_edges(map_, worlds.loops(truth, rng, lap=LAP)))
@@ -41,7 +29,7 @@ def test_K1_a_loop_moves_the_past() -> None:
 
 @pytest.mark.parametrize("seed", range(5))
 def test_false_loops_are_switched_off_and_true_ones_kept(seed: int) -> None:
-    map_, truth, rng = drive(seed)
+    map_, truth, rng = worlds.drive(NUM, seed)
     true = worlds.loops(truth, rng, lap=LAP)
     clean, _ = optimize_map(add_edges(map_, true))
     ends = rng.permutation(NUM)
@@ -57,7 +45,7 @@ def test_false_loops_are_switched_off_and_true_ones_kept(seed: int) -> None:
 
 
 def test_the_first_vertex_stays() -> None:
-    map_, truth, rng = drive(2)
+    map_, truth, rng = worlds.drive(NUM, 2)
 
     closed, _ = optimize_map(add_edges(map_, worlds.loops(truth, rng, lap=LAP)))
 
@@ -67,7 +55,7 @@ def test_the_first_vertex_stays() -> None:
 
 
 def test_edges_of_unknown_kinds_are_counted_and_kept() -> None:
-    map_, truth, rng = drive(3)
+    map_, truth, rng = worlds.drive(NUM, 3)
     kinds = map_.edges.kind.copy()
     kinds[3] = "sonar"
     odd = add_edges(

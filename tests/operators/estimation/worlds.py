@@ -6,6 +6,8 @@ from itertools import pairwise
 
 import numpy as np
 
+from mapstream.recordings.maps.model import Map
+from mapstream.recordings.maps.submaps import append_submap
 from mapstream.streams.geometry import SE3, se3_exp
 from mapstream.streams.messages.estimates import Keyframe, Odometry, RelativePose, Submap
 
@@ -63,6 +65,16 @@ def submaps(truth: list[SE3], rng: np.random.Generator, *, size: int = 10) -> li
         )
         for k, i in enumerate(starts)
     ]
+
+
+def drive(num_poses: int, seed: int) -> tuple[Map, list[SE3], np.random.Generator]:
+    """Return the map of a drive without loops, its true poses, and the generator that goes on."""
+    rng = np.random.default_rng(seed)
+    truth = circle(num_poses)
+    map_ = Map.empty()
+    for submap in submaps(truth, rng):
+        map_ = append_submap(map_, submap)
+    return map_, truth, rng
 
 
 def loops(
