@@ -273,7 +273,7 @@ async def test_B12_auto_rate_does_not_wait_for_a_join_that_waits_for_the_source(
     )
     plan = replace(plan, profile=ProfileSpec(clock=ClockSpec(rate="auto")))
 
-    with anyio.fail_after(20):
+    with anyio.fail_after(120):  # rather than forever
         report = await run_graph(plan)
 
     assert len(outputs()) == 50
