@@ -5,11 +5,10 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from types import TracebackType
-from typing import Self
 
 _SERVER = """
 import json, os, sys, tempfile
@@ -46,34 +45,25 @@ class Ended:
     output: str  # standard output and error
 
 
-class CommandLine:
-    """Runs `mapstream` commands one after another in a folder."""
+@contextmanager
+def command_line(
+    folder: Path, environment: dict[str, str]
+) -> Iterator[Callable[[Sequence[str]], Ended]]:
+    """Yield what runs `mapstream` commands, one after another in a folder."""
+    with subprocess.Popen(
+        [sys.executable, "-c", _SERVER],
+        cwd=folder,
+        env=environment,
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+    ) as server:
+        commands, results = server.stdin, server.stdout
+        assert commands is not None
+        assert results is not None
 
-    def __init__(self, folder: Path, environment: dict[str, str]) -> None:
-        self._process = subprocess.Popen(
-            [sys.executable, "-c", _SERVER],
-            cwd=folder,
-            env=environment,
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            text=True,
-        )
+        def run(words: Sequence[str]) -> Ended:
+            print(json.dumps(list(words)), file=commands, flush=True)
+            return Ended(*json.loads(results.readline()))
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self._process.communicate()
-
-    def run(self, words: Sequence[str]) -> Ended:
-        assert self._process.stdin is not None
-        assert self._process.stdout is not None
-        self._process.stdin.write(json.dumps(list(words)) + "\n")
-        self._process.stdin.flush()
-        code, output = json.loads(self._process.stdout.readline())
-        return Ended(code, output)
+        yield run

@@ -15,7 +15,7 @@ import pytest
 from mapstream.graph.catalogue import Catalogue
 from mapstream.graph.load import load_graph
 from mapstream.graph.plan import plan
-from tests.command_line import CommandLine
+from tests.command_line import command_line
 from tests.installed import look_installed
 
 ROOT = Path(__file__).parent.parent
@@ -56,13 +56,13 @@ def test_commands_on_the_page_succeed(page: Path, tmp_path: Path, installed_exam
     folder.mkdir()
     (folder / "examples").symlink_to(ROOT / "examples")
     environment = {**os.environ, "PYTHONPATH": str(installed_examples), "COLUMNS": "200"}
-    with CommandLine(folder, environment) as command_line:
+    with command_line(folder, environment) as run:
         for line in "\n".join(blocks(page, "console")).splitlines():
             if not line.startswith("$ mapstream "):
                 continue  # output, or an installation that the fixture stands for
             command, _, remark = line.removeprefix("$ mapstream ").partition("# exits ")
 
-            ended = command_line.run(shlex.split(command))
+            ended = run(shlex.split(command))
 
             assert ended.code == int(remark or 0), f"{line}\n{ended.output}"
 
