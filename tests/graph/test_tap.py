@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections import Counter
 from collections.abc import Iterable
 from dataclasses import replace
@@ -91,16 +90,13 @@ async def test_O1_a_stopped_viewer_does_not_slow_the_run() -> None:
     """All is sent while the viewer takes nothing; memory stays bounded and the loss is said."""
     plan, sink = drive_plan(num_steps=100, num_points=2000), SlowSink()
     tap = RerunTap(plan, sink, max_bytes=200_000)
-    started_s = time.monotonic()
     report = await run_graph(plan, taps=[tap])
     tap.close()
-    took_s = time.monotonic() - started_s
-    sink.may_go_on.set()
+    sink.may_go_on.set()  # only now: had the run waited for the viewer, it would wait for ever
 
     assert {edge.received for edge in report.final.edges if "scans" in edge.name} == {100}
     assert tap.queue.high_water_bytes <= 200_000
     assert any("not drawn" in note for note in tap.notes())
-    assert took_s < 10  # it would wait for ever
 
 
 async def test_O1_the_tap_sees_every_map() -> None:
