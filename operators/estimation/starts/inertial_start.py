@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
-from itertools import pairwise
 
 import gtsam
 import numpy as np
@@ -30,8 +29,9 @@ def with_known_biases(map_: Map, new_rows: IntArray) -> Map:
     gyro, accel = map_.vertices.gyro_bias_radps.copy(), map_.vertices.accel_bias_mps2.copy()
     for mission in np.unique(map_.vertices.mission[new_rows]).tolist():
         rows = map_.vertices_of(mission)
-        for before, row in pairwise(rows.tolist()):
-            if row in new_rows and np.isnan(gyro[row]).any():
+        for at in np.flatnonzero(np.isin(rows[1:], new_rows)).tolist():
+            before, row = rows[at : at + 2].tolist()
+            if np.isnan(gyro[row]).any():
                 gyro[row], accel[row] = gyro[before], accel[before]
     vertices = replace(map_.vertices, gyro_bias_radps=gyro, accel_bias_mps2=accel)
     return replace(map_, vertices=vertices)
