@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -16,13 +17,22 @@ from mapstream.operators.estimation.gauge import gauge_factors
 from mapstream.operators.estimation.incremental import IncrementalProblem
 from mapstream.operators.estimation.kinds import make_factors
 from mapstream.operators.estimation.noise import Factor, NoiseModels
+from mapstream.operators.estimation.outliers.absolute_outliers import reject_absolute
+from mapstream.operators.estimation.outliers.innovations import Judge, review, take_in
+from mapstream.operators.estimation.outliers.lonely_fixes import (
+    false_fixes,
+    far_off,
+    lonely_fixes,
+    switched,
+)
 from mapstream.operators.estimation.priors import prior_factors
 from mapstream.operators.estimation.problem import with_loss
 from mapstream.operators.estimation.starts.first_fixes import (
+    FEWEST_FIXES,
     FirstFixes,
     headed,
+    inertial_missions,
     is_linked,
-    without_false_fixes,
 )
 from mapstream.operators.estimation.starts.inertial_start import (
     dead_reckoned,
@@ -41,6 +51,7 @@ from mapstream.streams.messages.estimates import MapCorrection, RelativePose, Su
 from mapstream.streams.messages.sensors import IntArray
 
 _CONSISTENT_CHI2 = 16.8  # per loop: 99 % of a chi2 with six degrees of freedom
+_FIRST_IF_FALSE = 12  # fixes that say how a mission heads, where some of them are false
 
 
 class LiveMap:
@@ -51,6 +62,8 @@ class LiveMap:
     Loops enter as plain factors, since a robust cost would throw out a true loop that contradicts drift.
     When the loops contradict each other or the rest, the batch solver says which are false, and their
     factors leave the problem; they stay in the map with the switch that they got.
+    Where absolute measurements may be false, those on missions that only an IMU leads along are judged one by one
+    before they enter the problem, and all of them again at the end.
     """
 
     def __init__(self, config: OptimizeConfig, T_map_first: SE3 | None = None) -> None:
@@ -62,7 +75,7 @@ class LiveMap:
         self._symbols = PoseSymbols()
         self._noise_of = NoiseModels()
         self._seen: set[bytes] = set()  # ids of edges that are in the problem, or were found false
-        self._fixes = FirstFixes(8 if "position" in config.losses else 4)
+        self._fixes = FirstFixes(_FIRST_IF_FALSE if config.reject_absolute else FEWEST_FIXES)
         self._newest: dict[str, SE3] = {}  # mission -> T_odom_base of its newest vertex
 
     def ordered(self) -> Map:
@@ -108,11 +121,21 @@ class LiveMap:
         Raises:
             EstimationError: If the map has no finite solution.
         """
+        if self._config.reject_absolute:
+            self._fixes.meet_few()
+            self._solve_with(np.empty(0, dtype=np.int64))
+            self._judge(review)
         self.map = self.ordered()
-        if "position" in self._config.losses:
-            self.map = without_false_fixes(self.map, self._softened)
-        self.map, report = optimize_map(self.map, self._config)
-        return report
+        return self._optimize()
+
+    def _optimize(self) -> OptimizationReport:
+        """Solve the whole map; fixes on missions that only an IMU leads along are as they were judged."""
+        if self._config.reject_absolute:
+            linked = set(range(len(self.map.missions))) - inertial_missions(self.map)
+            self.map, _ = reject_absolute(self.map, missions=linked)
+        config = self._config.model_copy(update={"reject_absolute": False})
+        self.map, report = optimize_map(self.map, config)
+        return replace(report, rejected_absolute=false_fixes(self.map))
 
     def correction(self, mission_id: str) -> MapCorrection:
         """Return the present poses of a mission, and where its odometry frame lies."""
@@ -155,14 +178,20 @@ class LiveMap:
         self._seen |= named.keys()
         if meeting:
             for fixes in meeting:
-                self.map = headed(self.map, fixes, self._softened)
+                self.map = headed(self.map, fixes, self._doubted)
+                if self._config.reject_absolute:
+                    self.map = switched(self.map, far_off(self.map, fixes), 0.0)
             self._start_anew()
+            self._judge(review)
             return
         if not named and not gone:
             return
         added = named | self._holds({rows[n]: f for n, f in named.items()}, new_vertices)
         values = initial_values(self.map, self._problem.new_keys(added.values()))
-        self._problem.update(values, added, gone & self._problem.names)
+        doubtful = self._doubtful & added.keys()
+        certain = {name: factor for name, factor in added.items() if name not in doubtful}
+        self._problem.update(values, certain, gone & self._problem.names)
+        self._judge(take_in, doubtful)
         self._take()
         self._integrate_anew(rows)
 
@@ -183,6 +212,29 @@ class LiveMap:
         if loss is None:
             return factor
         return with_loss(factor, loss, widening * self._config.loss_width)
+
+    def _doubted(self, row: int, factor: Factor, widening: float) -> Factor:
+        """Return the factor under its loss, as wide as that; fixes that may be false have one."""
+        if self._config.reject_absolute and self.map.edges.kind[row] == "position":
+            return with_loss(factor, "geman_mcclure", widening * self._config.loss_width)
+        return self._softened(row, factor, widening)
+
+    @property
+    def _doubtful(self) -> set[bytes]:
+        """The edges that may be false, where only an IMU can tell."""
+        return set(lonely_fixes(self.map)) if self._config.reject_absolute else set()
+
+    def _judge(self, judge: Judge, names: set[bytes] | None = None) -> None:
+        """Let these measurements in, or all that were seen, unless the others contradict them."""
+        known = self._seen if names is None else names
+        rows = {name: row for name, row in lonely_fixes(self.map).items() if name in known}
+        if not rows:
+            return
+        made = self._made(list(rows.values()))
+        false = judge(self._problem, {name: made[name] for name in rows})
+        self.map = switched(self.map, list(rows.values()), 1.0)
+        self.map = switched(self.map, [rows[name] for name in false], 0.0)
+        self._take()
 
     def _holds(self, factors: dict[int, Factor], new_vertices: IntArray) -> dict[bytes, Factor]:
         """Return what holds missions that begin here, and weak priors on new variables of other kinds."""
@@ -215,13 +267,13 @@ class LiveMap:
     def _settle_contradiction(self) -> None:
         """Ask the batch solver which loops are false, and go on without their factors."""
         self.num_contradictions += 1
-        self.map, _ = optimize_map(self.map, self._config)
+        self._optimize()
         self._start_anew()
 
     def _start_anew(self) -> None:
         """Begin the problem again with the map as it is, less edges that were switched off."""
         edges = self.map.edges
-        is_on = ~edges.is_switchable | (edges.switch >= 0.5)
+        is_on = edges.switch >= 0.5
         rows = [at for at, row in enumerate(edges.id) if is_on[at] and row.tobytes() in self._seen]
         named = self._made(rows)
         row_of = self._names()

@@ -15,6 +15,7 @@ from mapstream.operators.estimation.keys import Variable, key_of, rows_by_variab
 from mapstream.operators.estimation.noise import Factor
 from mapstream.operators.estimation.states import Values
 from mapstream.streams.errors import EstimationError
+from mapstream.streams.messages.sensors import FloatArray
 
 Name = bytes  # of a factor; the caller chooses it
 _WEAK_SIGMA = 1e3  # [rad, m]: what holds a variable that nothing determines
@@ -100,6 +101,14 @@ class IncrementalProblem:
         """Return the squared weighted error of all factors at the present estimate."""
         values = self.values()
         return 2 * sum(float(factor.error(values)) for factor in self._factors.values())
+
+    def covariance(self, keys: Iterable[int]) -> tuple[FloatArray, dict[int, slice]]:
+        """Return the joint covariance (D, D) of variables in their tangent spaces, and where each lies in it."""
+        ordered = sorted(keys)
+        joint = self._isam.jointMarginalCovariance(ordered)
+        ends = np.cumsum([0, *(len(joint.at(key, key)) for key in ordered)]).tolist()
+        place = {key: slice(*ends[at : at + 2]) for at, key in enumerate(ordered)}
+        return np.block([[joint.at(a, b) for b in ordered] for a in ordered]), place
 
     def reset(self, values: Values, factors: Mapping[Name, Factor]) -> None:
         """Start anew with values and factors, for instance after a batch optimisation.

@@ -7,6 +7,7 @@ Cramariuc et al., RA-L 2023, section III-D; Fischler and Bolles, CACM 1981).
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -47,16 +48,26 @@ class RejectAbsoluteReport:
 
 
 def reject_absolute(
-    map_: Map, config: RejectAbsoluteConfig | None = None
+    map_: Map,
+    config: RejectAbsoluteConfig | None = None,
+    *,
+    missions: Collection[int] | None = None,
 ) -> tuple[Map, RejectAbsoluteReport]:
     """Return the map with the switch 0 on absolute measurements that contradict the others.
 
     Where there are fewer than three of one frame and one mission, none is touched. A switch that was 0 before is
     looked at again.
+
+    Args:
+        map_: Whose missions have trajectories that are rigid over a window of fixes.
+        config: What counts as a contradiction.
+        missions: Their rows; left out, all missions.
     """
     config = config or RejectAbsoluteConfig()
     edges = map_.edges
     rows = np.flatnonzero(np.isin(edges.kind, _KINDS) & (edges.vertex_a >= 0))
+    if missions is not None:
+        rows = rows[np.isin(map_.vertices.mission[edges.vertex_a[rows]], list(missions))]
     mission = map_.vertices.mission[edges.vertex_a[rows]]
     rng = np.random.default_rng(config.seed)
     switch, untouched, rejected = edges.switch.copy(), 0, []

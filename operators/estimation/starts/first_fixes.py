@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import gtsam
 import numpy as np
@@ -19,10 +19,10 @@ from mapstream.recordings.maps.model import Map
 from mapstream.streams.errors import EstimationError
 from mapstream.streams.messages.sensors import IntArray
 
+FEWEST_FIXES = 4
 _MIN_SPREAD_M = 10.0
 _LINKS = ("odometry", "wheel", "registration")  # say how the robot moved, however it headed
 _MAX_ITERATIONS = 25
-_FALSE = 0.5  # a fix whose loss flattened its error to less than this is taken for false
 _WIDENINGS = (
     100.0,
     25.0,
@@ -48,10 +48,11 @@ class FirstFixes:
 
     def asleep(self, map_: Map) -> set[int]:
         """Return the missions that an IMU leads along alone, and no fixes yet: there is nothing to solve."""
-        awake = {mission for mission, _ in self.met}
-        inertial = map_.vertices.mission[map_.edges.vertex_a[map_.edges_of("imu")]]
-        alone = {m for m in np.unique(inertial).tolist() if not _is_linked(map_, m)}
-        return alone - awake
+        return inertial_missions(map_) - {mission for mission, _ in self.met}
+
+    def meet_few(self) -> None:
+        """Make do with the fewest fixes that say how a mission heads: no others will come."""
+        self.min_fixes = min(self.min_fixes, FEWEST_FIXES)
 
     def meet(self, map_: Map) -> list[IntArray]:
         """Return the fixes of each mission and frame that meet now, since there are enough of them."""
@@ -91,6 +92,12 @@ def is_linked(map_: Map, fixes: IntArray) -> bool:
     return _is_linked(map_, int(map_.vertices.mission[map_.edges.vertex_a[fixes[0]]]))
 
 
+def inertial_missions(map_: Map) -> set[int]:
+    """Return the missions that an IMU leads along alone."""
+    inertial = map_.vertices.mission[map_.edges.vertex_a[map_.edges_of("imu")]]
+    return {mission for mission in np.unique(inertial).tolist() if not _is_linked(map_, mission)}
+
+
 def _is_linked(map_: Map, mission: int) -> bool:
     edges = map_.edges
     own = (edges.vertex_a >= 0) & (map_.vertices.mission[edges.vertex_a] == mission)
@@ -123,30 +130,6 @@ def headed(map_: Map, fixes: IntArray, softened: Softening) -> Map:
         name = map_.mission_id(mission)
         raise EstimationError(f"mission {name}: no heading makes sense of its position fixes")
     return best.map
-
-
-def without_false_fixes(map_: Map, softened: Softening) -> Map:
-    """Return the map with inertial missions along their fixes, of which those that stay far off are switched off.
-
-    Between two fixes a second apart an IMU leaves no doubt; the longer it is alone, the less it can tell.
-    """
-    edges = map_.edges
-    fixes = np.flatnonzero((edges.kind == "position") & (edges.vertex_a >= 0))
-    missions = map_.vertices.mission[edges.vertex_a[fixes]]
-    switch = edges.switch.copy()
-    for mission in np.unique(missions).tolist():
-        own = fixes[missions == mission]
-        if _is_linked(map_, mission):
-            continue
-        map_ = headed(map_, own, softened)
-        factors = make_factors(map_, own, NoiseModels())
-        values = initial_values(map_, {key for f in factors.values() for key in f.keys()})  # noqa: SIM118
-        for row, factor in factors.items():
-            # Under a redescending loss at its inflection and beyond, a fix has no say any more.
-            plain = float(factor.error(values))
-            soft = float(softened(row, factor, _WIDENINGS[-1]).error(values))
-            switch[row] = 0.0 if soft < _FALSE * plain else switch[row]
-    return replace(map_, edges=replace(map_.edges, switch=switch))
 
 
 @dataclass(frozen=True, slots=True)
