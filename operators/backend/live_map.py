@@ -33,6 +33,7 @@ from mapstream.operators.estimation.starts.first_fixes import (
     headed,
     inertial_missions,
     is_linked,
+    reconsidered,
 )
 from mapstream.operators.estimation.starts.inertial_start import (
     dead_reckoned,
@@ -124,9 +125,21 @@ class LiveMap:
         if self._config.reject_absolute:
             self._fixes.meet_few()
             self._solve_with(np.empty(0, dtype=np.int64))
-            self._judge(review)
+            self._reconsider()
         self.map = self.ordered()
         return self._optimize()
+
+    def _reconsider(self) -> None:
+        """Judge fixes by the whole drive: a false one that came in may have kept true ones out."""
+        if not self._seen & self._doubtful:
+            return
+        fixes = np.array(list(lonely_fixes(self.map).values()), dtype=np.int64)
+        for mission in sorted(inertial_missions(self.map)):
+            self.map = reconsidered(self.map, mission, self._doubted)
+        self.map = switched(self.map, fixes.tolist(), 1.0)
+        self.map = switched(self.map, far_off(self.map, fixes), 0.0)
+        self._start_anew()
+        self._judge(review)
 
     def _optimize(self) -> OptimizationReport:
         """Solve the whole map; fixes on missions that only an IMU leads along are as they were judged."""

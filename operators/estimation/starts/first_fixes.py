@@ -132,6 +132,19 @@ def headed(map_: Map, fixes: IntArray, softened: Softening) -> Map:
     return best.map
 
 
+def reconsidered(map_: Map, mission: int, softened: Softening) -> Map:
+    """Return the map with a mission where most of its fixes have it, whichever of them were taken for false.
+
+    Args:
+        map_: Whose poses are near the solution, but for some stretches.
+        mission: Its row.
+        softened: Puts factors under robust losses.
+    """
+    for widening in _WIDENINGS:
+        map_ = _solved(map_, mission, softened, widening).map
+    return map_
+
+
 @dataclass(frozen=True, slots=True)
 class _Solution:
     map: Map
