@@ -75,7 +75,7 @@ def _kitti00(folder: Path, seed: int) -> Path:  # noqa: ARG001  # it lies in the
 
 def _inertial_params(recording: Path) -> dict[str, str]:  # noqa: ARG001  # as other demos ask it
     """Return how few positions are used; the others judge the map, for so few cannot judge each other."""
-    return {"position_period_s": "10", "reject_false": "false"}
+    return {"position_period_s": "10"}
 
 
 DEMOS = {

@@ -43,6 +43,7 @@ from mapstream.operators.estimation.starts.inertial_start import (
 from mapstream.operators.estimation.states import initial_values, with_solution
 from mapstream.operators.estimation.symbols import PoseSymbols
 from mapstream.recordings.maps.build import add_edges, anchored
+from mapstream.recordings.maps.ids import as_keys
 from mapstream.recordings.maps.model import Map
 from mapstream.recordings.maps.order import in_canonical_order
 from mapstream.recordings.maps.submaps import append_submap
@@ -172,7 +173,7 @@ class LiveMap:
 
     def _names(self) -> dict[bytes, int]:
         """Return the row of each edge by the name of its factor, which is the edge's id."""
-        return {row.tobytes(): at for at, row in enumerate(self.map.edges.id)}
+        return {name: at for at, name in enumerate(as_keys(self.map.edges.id).tolist())}
 
     def _solve_with(self, new_vertices: IntArray) -> None:
         """Bring the problem to the edges of the map, and take its solution."""
@@ -267,8 +268,9 @@ class LiveMap:
 
     def _integrate_anew(self, rows: Mapping[bytes, int]) -> None:
         """Replace IMU factors whose bias has moved too far since their samples were integrated."""
-        inertial = {rows[n]: f for n, f in self._problem.factors.items() if n in rows}
-        stale = outdated(self.map, inertial)
+        names = as_keys(self.map.edges.id[self.map.edges_of("imu")]).tolist()
+        factors = self._problem.factors
+        stale = outdated(self.map, {rows[n]: factors[n] for n in names if n in factors})
         if stale:
             named = self._made(stale)
             self._problem.update(initial_values(self.map, []), named, list(named))
