@@ -18,7 +18,7 @@ from mapstream.graph.cli.output import ExitCode, complain
 _TRACEBACK = "MAPSTREAM_TRACEBACK"  # the environment variable
 VERBS = {  # verb -> function or group of commands, and what a list of verbs says of it
     "run": ("run:run", "Run a graph on a recording, or on live sensors."),
-    "demo": ("demo:demo", "Simulate a drive, map it, and compare the map with the truth."),
+    "demo": ("demo:demo", "Map a drive that every machine has, and say how good the map is."),
     "check": ("check:check", "Find all mistakes of a graph without running it."),
     "graph": ("show:graph", "Draw a graph."),
     "operators": ("operators:operators", "List the operators, or tell all about one."),
