@@ -204,7 +204,7 @@ class LiveMap:
         values = initial_values(self.map, self._problem.new_keys(added.values()))
         doubtful = self._doubtful & added.keys()
         certain = {name: factor for name, factor in added.items() if name not in doubtful}
-        self._problem.update(values, certain, gone & self._problem.names)
+        self._problem.update(values, certain, sorted(gone & self._problem.factors.keys()))
         self._judge(take_in, doubtful)
         self._take()
         self._integrate_anew(rows)

@@ -41,6 +41,7 @@ class IncrementalProblem:
         self._is_weak = False  # it was indeterminate as a whole, so each new variable gets a prior
         self._isam = _new_isam(is_precise=False)
         self._sound = gtsam.Values()  # the newest solution that was one
+        self._estimate: Values | None = None  # of this moment, once it was asked for: it takes its time
 
     def __len__(self) -> int:
         return len(self._keys)
@@ -75,6 +76,7 @@ class IncrementalProblem:
             added |= self._weak_priors(values, values.keys())
         self._keys |= set(values.keys())
         self._factors |= added
+        self._estimate = None
         try:
             result = self._isam.update(_graph_of(added.values()), values, gone)
             self._indices.update(zip(added, result.getNewFactorsIndices(), strict=True))
@@ -88,6 +90,7 @@ class IncrementalProblem:
         old = self._positions()
         for _ in range(most):
             self._isam.update()
+            self._estimate = None
             new = self._positions()
             if np.abs(new - old).max(initial=0.0) < tolerance_m:
                 return
@@ -95,7 +98,9 @@ class IncrementalProblem:
 
     def values(self) -> Values:
         """Return the present estimate of all variables."""
-        return self._isam.calculateEstimate()
+        if self._estimate is None:
+            self._estimate = self._isam.calculateEstimate()
+        return self._estimate
 
     def chi2(self) -> float:
         """Return the squared weighted error of all factors at the present estimate."""
@@ -141,7 +146,7 @@ class IncrementalProblem:
         isam = _new_isam(is_precise=self._is_precise)
         result = isam.update(_graph_of(self._factors.values()), values)
         self._indices = dict(zip(self._factors, result.getNewFactorsIndices(), strict=True))
-        self._isam = isam
+        self._isam, self._estimate = isam, None
         self._require_finite()
 
     def _rebuild(self, added: Values) -> None:
