@@ -41,7 +41,9 @@ class IncrementalProblem:
         self._is_weak = False  # it was indeterminate as a whole, so each new variable gets a prior
         self._isam = _new_isam(is_precise=False)
         self._sound = gtsam.Values()  # the newest solution that was one
-        self._estimate: Values | None = None  # of this moment, once it was asked for: it takes its time
+        self._estimate: Values | None = (
+            None  # of this moment, once it was asked for: it takes its time
+        )
 
     def __len__(self) -> int:
         return len(self._keys)
