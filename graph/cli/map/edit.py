@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from mapstream.graph.cli.map.choosing import MissionArgument, MissionOption, pose_of
-from mapstream.graph.cli.options import KeySetList, config_from
+from mapstream.graph.cli.options import ConfigT, KeySetList, config_from
 from mapstream.graph.cli.output import JsonFlag, in_place, say, say_json
 from mapstream.operators.maps import anchor as anchors
 from mapstream.operators.maps import edit as tools
@@ -27,50 +27,48 @@ EdgeList = Annotated[
 ]
 
 
-@edit.command()
-def uncertainty(  # noqa: PLR0913  # one for each option of the command
-    context: typer.Context,
-    *,
-    kind: KindOption = None,
-    source: SourceOption = None,
-    mission: MissionOption = None,
-    edge: EdgeList = None,
-    set_: KeySetList = None,
-    json: JsonFlag = False,
+def _add_verb(
+    name: str,
+    config_type: type[ConfigT],
+    tool: Callable[[Map, IntArray, ConfigT], Map],
+    meaning: str,
 ) -> None:
-    """Set how uncertain edges are: rotation_sigma_rad, translation_sigma_m, factor."""
-    config = config_from(tools.Uncertainty, set_)
-    _edit_edges(
-        context.obj,
-        "edit uncertainty",
-        {"kind": kind, "source": source, "mission": mission, "edge": edge},
-        config.model_dump(exclude_defaults=True),
-        lambda map_, rows: tools.set_uncertainty(map_, rows, config),
-        json=json,
-    )
+    """Make the verb that sets something on chosen edges."""
+
+    @edit.command(name, help=meaning)
+    def command(  # noqa: PLR0913  # one for each option of the command
+        context: typer.Context,
+        *,
+        kind: KindOption = None,
+        source: SourceOption = None,
+        mission: MissionOption = None,
+        edge: EdgeList = None,
+        set_: KeySetList = None,
+        json: JsonFlag = False,
+    ) -> None:
+        config = config_from(config_type, set_)
+        _edit_edges(
+            context.obj,
+            f"edit {name}",
+            {"kind": kind, "source": source, "mission": mission, "edge": edge},
+            config.model_dump(exclude_defaults=True),
+            lambda map_, rows: tool(map_, rows, config),
+            json=json,
+        )
 
 
-@edit.command()
-def switch(  # noqa: PLR0913
-    context: typer.Context,
-    *,
-    kind: KindOption = None,
-    source: SourceOption = None,
-    mission: MissionOption = None,
-    edge: EdgeList = None,
-    set_: KeySetList = None,
-    json: JsonFlag = False,
-) -> None:
-    """Set switches of edges: value (0 false, 1 true), variance, is_switchable."""
-    config = config_from(tools.Switch, set_)
-    _edit_edges(
-        context.obj,
-        "edit switch",
-        {"kind": kind, "source": source, "mission": mission, "edge": edge},
-        config.model_dump(exclude_defaults=True),
-        lambda map_, rows: tools.set_switch(map_, rows, config),
-        json=json,
-    )
+_add_verb(
+    "uncertainty",
+    tools.Uncertainty,
+    tools.set_uncertainty,
+    "Set how uncertain edges are: rotation_sigma_rad, translation_sigma_m, factor.",
+)
+_add_verb(
+    "switch",
+    tools.Switch,
+    tools.set_switch,
+    "Set switches of edges: value (0 false, 1 true), variance, is_switchable.",
+)
 
 
 def _edit_edges(
