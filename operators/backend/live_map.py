@@ -241,7 +241,8 @@ class LiveMap:
     def _judge(self, judge: Judge, names: set[bytes] | None = None) -> None:
         """Let these measurements in, or all that were seen, unless the others contradict them."""
         known = self._seen if names is None else names
-        rows = {name: row for name, row in lonely_fixes(self.map).items() if name in known}
+        fixes = lonely_fixes(self.map) if known else {}  # looking for them reads all edges
+        rows = {name: row for name, row in fixes.items() if name in known}
         if not rows:
             return
         made = self._made(list(rows.values()))
