@@ -22,7 +22,7 @@ from mapstream.operators.estimation.report import OptimizationReport
 from mapstream.operators.estimation.starts.start import chordal_values
 from mapstream.recordings.g2o import read_g2o
 from mapstream.recordings.maps.model import Map
-from mapstream.streams.messages.sensors import FloatArray
+from mapstream.streams.arrays import FloatArray
 
 REFERENCE = {  # 0.5 chi2 of the optimum
     "tinyGrid3D": 9.313904,

@@ -16,8 +16,8 @@ from mapstream.graph.plan import Plan
 from mapstream.graph.tap_outputs import Output
 from mapstream.graph.views.run import GRAPH, graph_extent
 from mapstream.recordings.maps import Map
-from mapstream.streams.messages import estimates, sensors
-from mapstream.streams.messages.sensors import FloatArray
+from mapstream.streams.arrays import FloatArray
+from mapstream.streams.messages import estimates, sensors, vision
 
 _IN_SPACE = (
     sensors.LidarScan,
@@ -38,7 +38,7 @@ _KNOWN = (
     sensors.ImuBatch,
     sensors.GnssFix,
     sensors.TransformBatch,
-    estimates.ImageFeatures,
+    vision.ImageFeatures,
 )
 _CLOSED = (rrb.BlueprintPanel(state="collapsed"), rrb.SelectionPanel(state="collapsed"))
 _HIDDEN = rrb.EntityBehavior(visible=False)
@@ -92,7 +92,7 @@ def map_view(outputs: Sequence[Output], eye: rrb.EyeControls3D | None = None) ->
 
 def _cameras(plan: Plan, outputs: Sequence[Output]) -> list[rrb.View]:
     """Return a view per camera, with all features that were found in its pictures."""
-    features = [output for output in outputs if output.sends(estimates.ImageFeatures)]
+    features = [output for output in outputs if output.sends(vision.ImageFeatures)]
     views: list[rrb.View] = []
     for picture in (output for output in outputs if output.sends(*_PICTURES)):
         readers = _readers(plan, picture)

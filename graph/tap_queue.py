@@ -17,7 +17,7 @@ from threading import Condition
 from typing import Any
 
 from mapstream.recordings.maps import Map
-from mapstream.streams.messages import estimates, sensors
+from mapstream.streams.messages import estimates, sensors, vision
 from mapstream.streams.sizes import nbytes
 
 
@@ -35,7 +35,7 @@ _WORTH = {
     sensors.CameraFrame: Worth.SAMPLE,
     sensors.EncodedImage: Worth.SAMPLE,
     estimates.PointCloud: Worth.SAMPLE,
-    estimates.ImageFeatures: Worth.SAMPLE,
+    vision.ImageFeatures: Worth.SAMPLE,
     estimates.MapCorrection: Worth.NEWEST,
     Map: Worth.NEWEST,
     estimates.Submap: Worth.EVERY,

@@ -8,7 +8,7 @@ import numpy as np
 from pydantic import Field, PositiveFloat, model_validator
 
 from mapstream.operators.operator import OperatorConfig
-from mapstream.streams.messages.sensors import FloatArray
+from mapstream.streams.arrays import FloatArray
 
 _Three = Annotated[tuple[PositiveFloat, ...], Field(min_length=3, max_length=3)]
 _Row = Annotated[tuple[float, ...], Field(min_length=6, max_length=6)]

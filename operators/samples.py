@@ -9,7 +9,6 @@ import numpy as np
 
 from mapstream.streams.geometry import SE3
 from mapstream.streams.messages.estimates import (
-    ImageFeatures,
     Keyframe,
     LoopReport,
     MapCorrection,
@@ -28,6 +27,7 @@ from mapstream.streams.messages.sensors import (
     TransformBatch,
     WheelOdometry,
 )
+from mapstream.streams.messages.vision import ImageFeatures, NFrame
 
 PERIOD_NS = 100_000_000
 START_NS = 1_700_000_000_000_000_000
@@ -127,6 +127,10 @@ def _features(stamp_ns: int, i: int) -> ImageFeatures:
     )
 
 
+def _n_frame(stamp_ns: int, i: int) -> NFrame:
+    return NFrame(stamp_ns=stamp_ns, features=(_features(stamp_ns, i),))
+
+
 def _laser(stamp_ns: int, _: int) -> LaserScan2D:
     return LaserScan2D(
         stamp_ns=stamp_ns,
@@ -169,6 +173,7 @@ _MAKERS: dict[object, Callable[[int, int], Any]] = {
     EncodedImage: _png,
     GnssFix: _fix,
     ImageFeatures: _features,
+    NFrame: _n_frame,
     ImuBatch: _imu,
     Keyframe: _keyframe,
     LaserScan2D: _laser,

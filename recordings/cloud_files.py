@@ -17,9 +17,8 @@ import numpy as np
 import numpy.typing as npt
 
 from mapstream.recordings.maps.folder import write_whole
-from mapstream.streams.arrays import frozen, frozen_optional
+from mapstream.streams.arrays import Float32Array, frozen, frozen_optional
 from mapstream.streams.errors import RecordingError
-from mapstream.streams.messages.sensors import Float32Array
 
 _MAX_HEADER_BYTES = 65_536
 _KINDS = ("i1", "u1", "i2", "u2", "i4", "u4", "f4", "f8")

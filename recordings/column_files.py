@@ -23,11 +23,12 @@ from pathlib import Path
 
 import numpy as np
 
+from mapstream.streams.arrays import FloatArray
 from mapstream.streams.errors import RecordingError
 from mapstream.streams.geometry import SE3
 from mapstream.streams.messages.constraints import Constraint, OuterFrame
 from mapstream.streams.messages.estimates import Odometry
-from mapstream.streams.messages.sensors import FloatArray, GnssFix, ImuBatch, Message
+from mapstream.streams.messages.sensors import GnssFix, ImuBatch, Message
 
 STAMPS = {"stamp_ns": 1, "stamp_us": 1_000, "stamp_ms": 1_000_000, "stamp_s": 1_000_000_000}
 Cells = dict[str, float]  # of one row, by column

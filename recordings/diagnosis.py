@@ -18,8 +18,9 @@ from mapstream.recordings.input_checks import InputChecks
 from mapstream.recordings.recording import Loss, RawMessage, Recording, Topic
 from mapstream.recordings.sensor_checks import CloudChecks, check_imu
 from mapstream.recordings.stamp_checks import Finding, Times, check_offsets, check_times
+from mapstream.streams.arrays import FloatArray
 from mapstream.streams.errors import DecodeError
-from mapstream.streams.messages.sensors import FloatArray, ImuBatch, LidarScan
+from mapstream.streams.messages.sensors import ImuBatch, LidarScan
 
 _BATCH = 256  # IMU messages that are decoded together
 _PROGRESS = 1000  # messages between two calls of on_progress

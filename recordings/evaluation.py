@@ -17,9 +17,9 @@ from mapstream.recordings.pose_pairs import (
     align,
     associate,
 )
+from mapstream.streams.arrays import FloatArray, IntArray
 from mapstream.streams.errors import EstimationError
 from mapstream.streams.geometry import invert, so3_log
-from mapstream.streams.messages.sensors import FloatArray, IntArray
 
 __all__ = [
     "Alignment",

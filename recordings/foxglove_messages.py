@@ -15,12 +15,12 @@ from mcap_protobuf.schema import build_file_descriptor_set
 
 from mapstream.recordings.decoding.foxglove import protobuf_class
 from mapstream.recordings.recording import Channel
+from mapstream.streams.arrays import FloatArray
 from mapstream.streams.geometry import quat_xyzw_from_rotation
 from mapstream.streams.messages.estimates import MapCorrection, Odometry, PointCloud
 from mapstream.streams.messages.sensors import (
     CameraFrame,
     EncodedImage,
-    FloatArray,
     GnssFix,
     LidarScan,
     Message,

@@ -24,8 +24,8 @@ from mapstream.recordings.maps.folder import write_whole
 from mapstream.recordings.maps.model import Map
 from mapstream.recordings.maps.tables import BoolArray, Edges
 from mapstream.recordings.pose_graph import ROBOT_SHIFT, PoseGraph, map_of, robots_of
+from mapstream.streams.arrays import FloatArray, IntArray
 from mapstream.streams.errors import RecordingError
-from mapstream.streams.messages.sensors import FloatArray, IntArray
 
 
 def read_g2o(*paths: Path | str, are_loops_switchable: bool = False) -> Map:

@@ -17,9 +17,9 @@ from pathlib import Path
 import numpy as np
 
 from mapstream.recordings.maps.tables import BoolArray
+from mapstream.streams.arrays import FloatArray, IntArray
 from mapstream.streams.errors import RecordingError
 from mapstream.streams.geometry import quat_xyzw_from_rotation, rotation_from_quat_xyzw
-from mapstream.streams.messages.sensors import FloatArray, IntArray
 
 PLANAR_VARIANCE = 1e-4  # of z [m^2], roll and pitch [rad^2] in edges of planar graphs
 LIFTED = [0, 1, 5]  # roll, pitch, z in our order

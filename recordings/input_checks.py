@@ -9,9 +9,10 @@ from typing import Any
 import numpy as np
 
 from mapstream.recordings.stamp_checks import Finding
+from mapstream.streams.arrays import FloatArray
 from mapstream.streams.messages.constraints import Constraint, LoopClosure
-from mapstream.streams.messages.estimates import ImageFeatures, Odometry
-from mapstream.streams.messages.sensors import FloatArray
+from mapstream.streams.messages.estimates import Odometry
+from mapstream.streams.messages.vision import ImageFeatures
 
 _SYMMETRY = 1e-6  # of a covariance: what rounding to single precision leaves
 _MAX_STEP_M = 20.0  # between two messages of odometry

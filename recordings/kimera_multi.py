@@ -15,9 +15,9 @@ import numpy as np
 
 from mapstream.recordings.maps.model import Map
 from mapstream.recordings.pose_graph import ROBOT_SHIFT, PoseGraph, map_of
+from mapstream.streams.arrays import FloatArray
 from mapstream.streams.errors import RecordingError
 from mapstream.streams.geometry import rotation_from_quat_xyzw
-from mapstream.streams.messages.sensors import FloatArray
 
 HEADER = (
     "robot_src,pose_src,robot_dst,pose_dst,qx,qy,qz,qw,tx,ty,tz,kappa,tau,is_known_inlier,weight"

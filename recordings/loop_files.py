@@ -22,11 +22,11 @@ from pathlib import Path
 
 import numpy as np
 
+from mapstream.streams.arrays import FloatArray
 from mapstream.streams.errors import ConfigError, RecordingError
 from mapstream.streams.fields import Fields
 from mapstream.streams.geometry import SE3
 from mapstream.streams.messages.estimates import RelativePose
-from mapstream.streams.messages.sensors import FloatArray
 
 SUFFIXES = (".yaml", ".yml", ".csv")
 _COLUMNS = (

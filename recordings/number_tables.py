@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
+from mapstream.streams.arrays import FloatArray, IntArray
 from mapstream.streams.errors import RecordingError
-from mapstream.streams.messages.sensors import FloatArray, IntArray
 
 
 def read_table(

@@ -18,9 +18,9 @@ from mapstream.recordings.maps.ids import mission_id
 from mapstream.recordings.maps.model import Map, vertex_ids
 from mapstream.recordings.maps.rows import concatenate
 from mapstream.recordings.maps.tables import BoolArray, Edges, Vertices
+from mapstream.streams.arrays import FloatArray, IntArray
 from mapstream.streams.errors import RecordingError
 from mapstream.streams.geometry import invert
-from mapstream.streams.messages.sensors import FloatArray, IntArray
 
 ROBOT_SHIFT = 56  # bits below the robot's number
 

@@ -10,9 +10,9 @@ from typing import Literal
 
 import numpy as np
 
+from mapstream.streams.arrays import FloatArray, IntArray
 from mapstream.streams.errors import EstimationError
 from mapstream.streams.geometry import so3_exp
-from mapstream.streams.messages.sensors import FloatArray, IntArray
 from mapstream.streams.trajectory import Trajectory
 
 AlignmentMode = Literal["se3", "sim3", "yaw", "none"]

@@ -7,7 +7,8 @@ from typing import Final
 import numpy as np
 
 from mapstream.recordings.stamp_checks import Finding
-from mapstream.streams.messages.sensors import FloatArray, LidarScan
+from mapstream.streams.arrays import FloatArray
+from mapstream.streams.messages.sensors import LidarScan
 
 GRAVITY_MPS2: Final = 9.81
 _UNITS: Final = {1.0: "g", 981.0: "cm/s^2", 9810.0: "mm/s^2"}  # of an accelerometer at rest

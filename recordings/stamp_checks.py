@@ -8,7 +8,7 @@ from typing import Final, Literal
 
 import numpy as np
 
-from mapstream.streams.messages.sensors import IntArray
+from mapstream.streams.arrays import IntArray
 
 _UNITS: Final = {1_000: "microseconds", 1_000_000: "milliseconds", 1_000_000_000: "seconds"}
 _JUMP_NS: Final = 10**9  # of a clock against the log time

@@ -17,9 +17,9 @@ from pathlib import Path
 import numpy as np
 
 from mapstream.recordings.maps.folder import write_whole
+from mapstream.streams.arrays import FloatArray, IntArray
 from mapstream.streams.errors import RecordingError
 from mapstream.streams.geometry import SE3, quat_xyzw_from_rotation, rotation_from_quat_xyzw
-from mapstream.streams.messages.sensors import FloatArray, IntArray
 from mapstream.streams.trajectory import Trajectory
 
 KITTI_PERIOD_NS = 100_000_000  # nominal, for poses without a file of times

@@ -12,7 +12,6 @@ from mapstream.streams.messages.constraints import (
     OuterFrame,
 )
 from mapstream.streams.messages.estimates import (
-    ImageFeatures,
     Keyframe,
     LoopCandidate,
     LoopReport,
@@ -35,6 +34,7 @@ from mapstream.streams.messages.sensors import (
     TransformBatch,
     WheelOdometry,
 )
+from mapstream.streams.messages.vision import ImageFeatures, NFrame
 from mapstream.streams.sync import (
     anchored,
     approximate,
@@ -70,6 +70,7 @@ __all__ = [
     "MapCorrection",
     "MappingError",
     "Message",
+    "NFrame",
     "Odometry",
     "OuterFrame",
     "PointCloud",

@@ -7,6 +7,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+FloatArray = npt.NDArray[np.float64]
+Float32Array = npt.NDArray[np.float32]
+IntArray = npt.NDArray[np.int64]
+
 
 def frozen(
     owner: object, field: str, dtype: npt.DTypeLike, shape: tuple[int | None, ...]

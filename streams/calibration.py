@@ -11,8 +11,7 @@ from typing import Literal, get_args
 
 import numpy as np
 
-from mapstream.streams.arrays import frozen
-from mapstream.streams.messages.sensors import FloatArray
+from mapstream.streams.arrays import FloatArray, frozen
 
 CameraModel = Literal["pinhole", "unified"]
 Distortion = Literal["none", "radtan", "equidistant", "fov", "rational_polynomial"]

@@ -15,8 +15,8 @@ from ruamel.yaml import YAML
 from ruamel.yaml.error import YAMLError
 from ruamel.yaml.nodes import MappingNode, Node, ScalarNode, SequenceNode
 
+from mapstream.streams.arrays import FloatArray
 from mapstream.streams.errors import ConfigError
-from mapstream.streams.messages.sensors import FloatArray
 
 R = TypeVar("R")
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
+from mapstream.streams.arrays import FloatArray
 from mapstream.streams.calibration import CameraCalibration, RangeImageCalibration
-from mapstream.streams.messages.sensors import FloatArray
 from mapstream.streams.rig import Rig
 from mapstream.streams.rig_layout import (
     COVARIANCE_KEYS,

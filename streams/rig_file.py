@@ -15,11 +15,11 @@ from typing import Any, TypeVar
 import numpy as np
 from ruamel.yaml import YAML
 
+from mapstream.streams.arrays import FloatArray
 from mapstream.streams.calibration import CameraCalibration, Distortion, RangeImageCalibration
 from mapstream.streams.errors import ConfigError, TransformError
 from mapstream.streams.fields import Fields
 from mapstream.streams.geometry import SE3
-from mapstream.streams.messages.sensors import FloatArray
 from mapstream.streams.rig import Extrinsics, Rig
 from mapstream.streams.rig_document import rig_document
 from mapstream.streams.rig_layout import (

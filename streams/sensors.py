@@ -12,10 +12,9 @@ from typing import Literal
 
 import numpy as np
 
-from mapstream.streams.arrays import frozen_optional
+from mapstream.streams.arrays import FloatArray, frozen_optional
 from mapstream.streams.calibration import CameraCalibration, RangeImageCalibration
 from mapstream.streams.geometry import SE3
-from mapstream.streams.messages.sensors import FloatArray
 
 SensorKind = Literal[
     "imu",

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from mapstream.streams.arrays import FloatArray
 from mapstream.streams.geometry import invert, se3_exp, se3_log
-from mapstream.streams.messages.sensors import FloatArray
 from mapstream.streams.trajectory import Trajectory
 
 

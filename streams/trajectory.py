@@ -7,9 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from mapstream.streams.arrays import frozen
+from mapstream.streams.arrays import FloatArray, IntArray, frozen
 from mapstream.streams.geometry import SE3, interpolate
-from mapstream.streams.messages.sensors import FloatArray, IntArray
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -12,9 +12,10 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from mapstream.streams.arrays import FloatArray
 from mapstream.streams.errors import TransformError
 from mapstream.streams.geometry import SE3
-from mapstream.streams.messages.sensors import FloatArray, TransformBatch
+from mapstream.streams.messages.sensors import TransformBatch
 
 
 @dataclass(slots=True)

@@ -19,8 +19,8 @@ from mapstream.recordings.decoding import decoder_for
 from mapstream.recordings.maps import Map, check_map, load_map
 from mapstream.recordings.recording import open_recording
 from mapstream.recordings.worlds.catalogue import simulate
+from mapstream.streams.arrays import FloatArray
 from mapstream.streams.geometry import invert
-from mapstream.streams.messages.sensors import FloatArray
 from mapstream.streams.replay_clock import ReplayClock
 from mapstream.streams.trajectory import Trajectory
 from tests.data import shared

@@ -39,7 +39,7 @@ from mapstream.graph.views.run import operator_graph, view_snapshot
 from mapstream.graph.views.scene import Columns, Entry, Scene, View, ViewSettings
 from mapstream.graph.views.unknown import view_unknown
 from mapstream.recordings.maps import Map
-from mapstream.streams.messages import constraints, estimates, sensors
+from mapstream.streams.messages import constraints, estimates, sensors, vision
 
 __all__ = [
     "GROUP",
@@ -70,7 +70,7 @@ _BUILT_IN: dict[type, View] = {
     estimates.Submap: view_submap,
     estimates.LoopReport: view_loop_report,
     estimates.MapCorrection: view_map_correction,
-    estimates.ImageFeatures: view_image_features,
+    vision.ImageFeatures: view_image_features,
     Map: view_map,
     Snapshot: view_snapshot,
 }

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial import cKDTree
 
-from mapstream.streams.messages.sensors import Float32Array, FloatArray
+from mapstream.streams.arrays import Float32Array, FloatArray
 
 _HEADROOM_M = 1.0  # above the base; what is lower is no ceiling
 _LID_M = 0.6  # thickness of what is taken off: ceilings are rough and have beams

@@ -11,8 +11,8 @@ import rerun as rr
 
 from mapstream.graph.views.colors import mission_color, switch_colors
 from mapstream.graph.views.scene import Entry, Scene, Vertex, transform
+from mapstream.streams.arrays import FloatArray, IntArray
 from mapstream.streams.geometry import SE3
-from mapstream.streams.messages.sensors import FloatArray, IntArray
 
 MAP_PATH = "/map"
 LINE = rr.Radius.ui_points(3.5)

@@ -11,8 +11,8 @@ from mapstream.graph.views.colors import KEYPOINT, ramp_colors
 from mapstream.graph.views.scene import Drawing, Entry, Scene
 from mapstream.graph.views.unknown import view_unknown
 from mapstream.streams.errors import MappingError
-from mapstream.streams.messages.estimates import ImageFeatures
 from mapstream.streams.messages.sensors import CameraFrame, EncodedImage
+from mapstream.streams.messages.vision import ImageFeatures
 
 _DEPTH_METER = {"16UC1": 1000.0, "32FC1": 1.0}  # value of a metre, by encoding
 _COLOR_MODEL = {"bgr8": rr.ColorModel.BGR, "rgb8": rr.ColorModel.RGB}

@@ -11,7 +11,7 @@ from mapstream.graph.views.colors import AXES, ramp_colors
 from mapstream.graph.views.growing import MAP_PATH
 from mapstream.graph.views.scene import Entry
 from mapstream.recordings.maps import Map
-from mapstream.streams.messages.sensors import FloatArray, IntArray
+from mapstream.streams.arrays import FloatArray, IntArray
 
 _PLANE = 0x56B4E9FF
 _SURFACE = 0x56B4E940  # one sees through it

@@ -8,8 +8,9 @@ import rerun as rr
 
 from mapstream.graph.views.colors import ColorArray, ramp_colors
 from mapstream.graph.views.scene import BASE, Drawing, Scene, sensor_frame
+from mapstream.streams.arrays import Float32Array
 from mapstream.streams.messages.estimates import PointCloud
-from mapstream.streams.messages.sensors import Float32Array, LaserScan2D, LidarScan
+from mapstream.streams.messages.sensors import LaserScan2D, LidarScan
 
 _POINT_SIZE = rr.Radius.ui_points(1.5)  # a scan of the moment, not yet in the map
 _BEAM_SIZE = rr.Radius.ui_points(3.0)

@@ -12,6 +12,7 @@ from mapstream.graph.views.colors import ACCEPTED, DRIVEN, REFUSED, mission_colo
 from mapstream.graph.views.growing import MAP_PATH, redraw_loops, redraw_mission
 from mapstream.graph.views.lidar import height_colors, thinned
 from mapstream.graph.views.scene import MAP, ODOM, Columns, Drawing, Entry, Scene, placed, transform
+from mapstream.streams.arrays import Float32Array
 from mapstream.streams.geometry import SE3
 from mapstream.streams.messages.estimates import (
     Keyframe,
@@ -20,7 +21,6 @@ from mapstream.streams.messages.estimates import (
     MapCorrection,
     Submap,
 )
-from mapstream.streams.messages.sensors import Float32Array
 
 _CLOUD_SIZE = rr.Radius.ui_points(1.2)
 _THIN = rr.Radius.ui_points(1.0)

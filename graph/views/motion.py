@@ -18,16 +18,10 @@ from mapstream.graph.views.scene import (
     placed,
     transform,
 )
+from mapstream.streams.arrays import FloatArray, IntArray
 from mapstream.streams.geometry import SE3
 from mapstream.streams.messages.estimates import Odometry
-from mapstream.streams.messages.sensors import (
-    FloatArray,
-    GnssFix,
-    ImuBatch,
-    IntArray,
-    TransformBatch,
-    WheelOdometry,
-)
+from mapstream.streams.messages.sensors import GnssFix, ImuBatch, TransformBatch, WheelOdometry
 
 _TRAIL_LENGTH = 100  # positions since the last correction
 

@@ -12,7 +12,7 @@ from mapstream.graph.views.growing import MAP_PATH
 from mapstream.graph.views.landmarks import axes
 from mapstream.graph.views.scene import Entry
 from mapstream.recordings.maps import Map
-from mapstream.streams.messages.sensors import FloatArray, IntArray
+from mapstream.streams.arrays import FloatArray, IntArray
 
 _KINDS = ("absolute", "position")  # of edges whose transform is T_frame_sensor
 _AXIS_M = 2.0

@@ -16,8 +16,8 @@ import numpy as np
 import numpy.typing as npt
 import rerun as rr
 
+from mapstream.streams.arrays import Float32Array, FloatArray, IntArray
 from mapstream.streams.geometry import SE3
-from mapstream.streams.messages.sensors import Float32Array, FloatArray, IntArray
 
 Vertex = tuple[str, int]  # mission, stamp
 MAP, ODOM, BASE = (

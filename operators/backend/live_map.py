@@ -47,10 +47,10 @@ from mapstream.recordings.maps.ids import as_keys
 from mapstream.recordings.maps.model import Map
 from mapstream.recordings.maps.order import in_canonical_order
 from mapstream.recordings.maps.submaps import append_submap
+from mapstream.streams.arrays import IntArray
 from mapstream.streams.errors import EstimationError
 from mapstream.streams.geometry import SE3
 from mapstream.streams.messages.estimates import MapCorrection, RelativePose, Submap
-from mapstream.streams.messages.sensors import IntArray
 
 _CONSISTENT_CHI2 = 16.8  # per loop: 99 % of a chi2 with six degrees of freedom
 _FIRST_IF_FALSE = 12  # fixes that say how a mission heads, where some of them are false

@@ -11,8 +11,8 @@ from mapstream.operators.estimation.keys import Variable, key_of
 from mapstream.operators.estimation.optimize_config import OptimizeConfig
 from mapstream.operators.estimation.problem import describe_failure, make_problem
 from mapstream.recordings.maps.model import Map
+from mapstream.streams.arrays import FloatArray
 from mapstream.streams.errors import EstimationError
-from mapstream.streams.messages.sensors import FloatArray
 
 
 def covariances(

@@ -17,8 +17,8 @@ from mapstream.operators.estimation.fixing import fixes
 from mapstream.operators.estimation.keys import variable_of
 from mapstream.operators.estimation.noise import Factor
 from mapstream.operators.estimation.problem import Problem, describe_variable, graph_of
+from mapstream.streams.arrays import FloatArray, IntArray
 from mapstream.streams.errors import EstimationError
-from mapstream.streams.messages.sensors import FloatArray, IntArray
 
 if TYPE_CHECKING:
     from scipy.sparse import csc_array

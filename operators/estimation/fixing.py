@@ -13,7 +13,7 @@ from mapstream.operators.estimation.factors.own_factor import OwnFactor, Residua
 from mapstream.operators.estimation.keys import Variable, key_of, rows_by_variable, variable_of
 from mapstream.operators.estimation.noise import Factor
 from mapstream.recordings.maps.model import Map
-from mapstream.streams.messages.sensors import FloatArray
+from mapstream.streams.arrays import FloatArray
 
 Fixable = Literal[
     "poses",

@@ -10,7 +10,7 @@ from mapstream.operators.estimation.keys import variable_of
 from mapstream.operators.estimation.noise import Factor
 from mapstream.recordings.maps.model import Map
 from mapstream.recordings.maps.tables import BoolArray
-from mapstream.streams.messages.sensors import FloatArray, IntArray
+from mapstream.streams.arrays import FloatArray, IntArray
 
 _LEVEL_KINDS = ("imu", "gravity")  # they know where up is
 _TIGHT = 1e4  # per rad and per m; it holds what nothing else does, so it costs nothing

@@ -14,8 +14,8 @@ import numpy as np
 from mapstream.operators.estimation.keys import Variable, key_of, rows_by_variable
 from mapstream.operators.estimation.noise import Factor
 from mapstream.operators.estimation.states import Values
+from mapstream.streams.arrays import FloatArray
 from mapstream.streams.errors import EstimationError
-from mapstream.streams.messages.sensors import FloatArray
 
 Name = bytes  # of a factor; the caller chooses it
 _WEAK_SIGMA = 1e3  # [rad, m]: what holds a variable that nothing determines

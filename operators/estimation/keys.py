@@ -11,7 +11,7 @@ from typing import Literal
 import gtsam
 import numpy as np
 
-from mapstream.streams.messages.sensors import IntArray
+from mapstream.streams.arrays import IntArray
 
 Variable = Literal["pose", "velocity", "bias", "landmark", "frame", "extrinsics"]
 

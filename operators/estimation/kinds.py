@@ -23,8 +23,8 @@ from mapstream.operators.estimation.factors import (
 from mapstream.operators.estimation.factors.edge_ends import edge_name
 from mapstream.operators.estimation.noise import Factor, NoiseModels
 from mapstream.recordings.maps.model import Map
+from mapstream.streams.arrays import IntArray
 from mapstream.streams.errors import EstimationError
-from mapstream.streams.messages.sensors import IntArray
 
 Maker = Callable[[Map, IntArray, NoiseModels], dict[int, Factor]]
 """From a map and rows of its edges of one kind to a factor by row, on the keys of `keys.py`."""

@@ -11,8 +11,8 @@ from mapstream.operators.estimation.factors import planes
 from mapstream.operators.estimation.factors.landmarks import shape_of
 from mapstream.operators.estimation.keys import key_of
 from mapstream.recordings.maps.model import Map
+from mapstream.streams.arrays import FloatArray, IntArray
 from mapstream.streams.geometry import invert, quat_xyzw_from_rotation
-from mapstream.streams.messages.sensors import FloatArray, IntArray
 
 
 def insert_landmarks(map_: Map, rows: IntArray, values: Any) -> None:  # noqa: ANN401

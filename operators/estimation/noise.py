@@ -7,8 +7,8 @@ from typing import Any
 import gtsam
 import numpy as np
 
+from mapstream.streams.arrays import FloatArray
 from mapstream.streams.errors import EstimationError
-from mapstream.streams.messages.sensors import FloatArray
 
 Factor = Any  # gtsam has no types
 

@@ -10,7 +10,7 @@ import numpy as np
 from mapstream.operators.estimation.factors.mounts import MountOf
 from mapstream.operators.estimation.factors.payloads import payloads
 from mapstream.recordings.maps.model import Map
-from mapstream.streams.messages.sensors import FloatArray, IntArray
+from mapstream.streams.arrays import FloatArray, IntArray
 
 
 def starting_frames(map_: Map, rows: IntArray) -> FloatArray:

@@ -17,7 +17,7 @@ from mapstream.operators.estimation.keys import key_of, rows_by_variable
 from mapstream.operators.estimation.noise import Factor
 from mapstream.operators.estimation.outer_frames import starting_frames
 from mapstream.recordings.maps.model import Map
-from mapstream.streams.messages.sensors import IntArray
+from mapstream.streams.arrays import IntArray
 
 _FRAME_SIGMAS = np.repeat([10.0, 1e5], 3)  # [rad, m]
 

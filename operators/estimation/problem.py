@@ -23,7 +23,7 @@ from mapstream.operators.estimation.solvers import Graph
 from mapstream.operators.estimation.states import Values, initial_values
 from mapstream.recordings.maps.model import Map
 from mapstream.recordings.maps.tables import BoolArray
-from mapstream.streams.messages.sensors import FloatArray, IntArray
+from mapstream.streams.arrays import FloatArray, IntArray
 
 _RELATIVE = ("odometry", "wheel", "registration", "motion_model", "loop")  # need no priors
 _LOSSES: dict[Loss, str] = {

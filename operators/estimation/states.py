@@ -18,8 +18,8 @@ from mapstream.operators.estimation.keys import Variable, key_of, rows_by_variab
 from mapstream.operators.estimation.landmark_states import insert_landmarks, with_landmarks
 from mapstream.operators.estimation.outer_frames import starting_frames
 from mapstream.recordings.maps.model import Map
+from mapstream.streams.arrays import FloatArray, IntArray
 from mapstream.streams.geometry import invert, straightened
-from mapstream.streams.messages.sensors import FloatArray, IntArray
 
 Values = Any  # gtsam has no types
 

@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from mapstream.streams.arrays import FloatArray
 from mapstream.streams.errors import ConfigError
 from mapstream.streams.messages.constraints import OuterFrame
-from mapstream.streams.messages.sensors import FloatArray
 
 _A, _E2 = 6_378_137.0, 6.694379990141317e-3  # WGS84: semi-major axis [m], squared eccentricity
 

@@ -10,10 +10,11 @@ from pydantic import NonNegativeFloat, PositiveFloat
 
 from mapstream.operators.gnss.geodesy import GeodeticPlane
 from mapstream.operators.operator import Operator, OperatorConfig, report_loss, warn
+from mapstream.streams.arrays import FloatArray
 from mapstream.streams.channel import Receiver, Sender
 from mapstream.streams.geometry import SE3
 from mapstream.streams.messages.constraints import Constraint, OuterFrame
-from mapstream.streams.messages.sensors import FloatArray, GnssFix
+from mapstream.streams.messages.sensors import GnssFix
 
 
 class GnssConfig(OperatorConfig):

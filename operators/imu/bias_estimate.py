@@ -12,9 +12,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from mapstream.operators.imu.parameters import ImuQuality
+from mapstream.streams.arrays import FloatArray, IntArray
 from mapstream.streams.errors import EstimationError
 from mapstream.streams.geometry import so3_exp, so3_log
-from mapstream.streams.messages.sensors import FloatArray, ImuBatch, IntArray
+from mapstream.streams.messages.sensors import ImuBatch
 
 
 @dataclass(frozen=True, slots=True, eq=False)

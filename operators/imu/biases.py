@@ -11,11 +11,12 @@ from mapstream.operators.imu.bias_estimate import ImuStart, PoseNoise, estimate_
 from mapstream.operators.imu.parameters import ImuQuality
 from mapstream.operators.imu.samples import cut, is_at_rest, joined, level_attitude
 from mapstream.operators.operator import Operator, OperatorConfig, offload, warn
+from mapstream.streams.arrays import FloatArray, IntArray
 from mapstream.streams.channel import Receiver, Sender
 from mapstream.streams.errors import EstimationError
 from mapstream.streams.geometry import SE3
 from mapstream.streams.messages.estimates import Odometry
-from mapstream.streams.messages.sensors import FloatArray, ImuBatch, IntArray
+from mapstream.streams.messages.sensors import ImuBatch
 
 
 class ImuBiasesConfig(OperatorConfig):

@@ -10,7 +10,7 @@ import numpy.typing as npt
 from pydantic import Field, PositiveFloat
 
 from mapstream.operators.operator import OperatorConfig
-from mapstream.streams.messages.sensors import FloatArray
+from mapstream.streams.arrays import FloatArray
 from mapstream.streams.sensors import ImuSensor
 
 BoolArray = npt.NDArray[np.bool_]

@@ -6,8 +6,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from mapstream.streams.arrays import FloatArray
 from mapstream.streams.geometry import so3_exp
-from mapstream.streams.messages.sensors import FloatArray, ImuBatch
+from mapstream.streams.messages.sensors import ImuBatch
 
 _BLOCK_S = 0.25
 _REST_RADPS, _REST_MPS2 = 0.01, 0.1  # how far means of blocks spread at rest

@@ -12,8 +12,9 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
+from mapstream.streams.arrays import FloatArray, IntArray
 from mapstream.streams.geometry import SE3, Array, invert, se3_exp, so3_exp
-from mapstream.streams.messages.sensors import FloatArray, ImuBatch, IntArray
+from mapstream.streams.messages.sensors import ImuBatch
 from mapstream.streams.trajectory import Trajectory
 
 _NUM_KNOTS = 64

@@ -10,8 +10,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from mapstream.streams.arrays import FloatArray
 from mapstream.streams.geometry import hat
-from mapstream.streams.messages.sensors import FloatArray
 
 _NOISE_FLOOR_M = 0.01  # of a range; simulated surfaces fit better than any real one
 _CORRELATION = 25.0  # neighbouring points share their errors: this many count as one

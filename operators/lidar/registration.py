@@ -17,9 +17,9 @@ import numpy.typing as npt
 import small_gicp
 
 from mapstream.operators.lidar.observability import covariance_of_planes
+from mapstream.streams.arrays import FloatArray
 from mapstream.streams.errors import ConfigError, EstimationError
 from mapstream.streams.geometry import SE3
-from mapstream.streams.messages.sensors import FloatArray
 
 Points = npt.NDArray[np.floating]  # (N, 3) [m]
 Method = Literal["icp", "plane", "gicp", "vgicp"]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from mapstream.streams.messages.sensors import IntArray
+from mapstream.streams.arrays import IntArray
 
 _BITS = 21  # of a voxel's coordinate on each axis, so that three fit into one int64
 _MASK = 2**_BITS - 1

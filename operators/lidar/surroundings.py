@@ -8,9 +8,9 @@ import numpy as np
 
 from mapstream.operators.lidar.trail import Trail
 from mapstream.recordings.cloud_store import CloudStore, cloud_key
+from mapstream.streams.arrays import FloatArray
 from mapstream.streams.errors import EstimationError
 from mapstream.streams.messages.estimates import Submap
-from mapstream.streams.messages.sensors import FloatArray
 
 
 class Surroundings:

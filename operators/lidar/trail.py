@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from mapstream.streams.arrays import FloatArray, IntArray
 from mapstream.streams.geometry import SE3
 from mapstream.streams.messages.estimates import MapCorrection, Submap
-from mapstream.streams.messages.sensors import FloatArray, IntArray
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

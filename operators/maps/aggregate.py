@@ -12,9 +12,9 @@ from mapstream.operators.lidar.sampling import voxel_keys
 from mapstream.operators.operator import OperatorConfig
 from mapstream.recordings.cloud_store import read_cloud
 from mapstream.recordings.maps.model import Map
+from mapstream.streams.arrays import FloatArray, IntArray
 from mapstream.streams.errors import MapError
 from mapstream.streams.messages.estimates import PointCloud
-from mapstream.streams.messages.sensors import FloatArray, IntArray
 
 _MAX_VOXELS = 2**20  # from the origin; farther ones would share a key
 _MIN_MERGE = 1_000_000  # points that are collected before voxels are merged

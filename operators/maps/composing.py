@@ -11,9 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mapstream.streams.arrays import frozen
+from mapstream.streams.arrays import FloatArray, frozen
 from mapstream.streams.geometry import SE3
-from mapstream.streams.messages.sensors import FloatArray
 
 _NEGLIGIBLE = 1e-12  # of an adjoint: what rounding leaves
 

@@ -14,9 +14,9 @@ import pyarrow as pa
 from pyarrow import csv
 
 from mapstream.recordings.maps.model import Map
+from mapstream.streams.arrays import FloatArray
 from mapstream.streams.errors import RecordingError
 from mapstream.streams.geometry import quat_xyzw_from_rotation
-from mapstream.streams.messages.sensors import FloatArray
 
 Columns = Mapping[str, npt.ArrayLike]
 

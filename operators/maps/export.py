@@ -17,10 +17,10 @@ from mapstream.recordings.maps.edge_kinds import RELATIVE_KINDS
 from mapstream.recordings.maps.model import Map
 from mapstream.recordings.mcap_writer import McapWriter
 from mapstream.recordings.trajectory_files import write_euroc, write_kitti, write_tum
+from mapstream.streams.arrays import IntArray
 from mapstream.streams.errors import MapError
 from mapstream.streams.geometry import SE3
 from mapstream.streams.messages.estimates import Odometry, RelativePose
-from mapstream.streams.messages.sensors import IntArray
 from mapstream.streams.trajectory import Trajectory
 
 

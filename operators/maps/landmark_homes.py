@@ -8,12 +8,12 @@ import numpy as np
 
 from mapstream.recordings.maps.model import Map
 from mapstream.recordings.maps.tables import BoolArray, Landmarks
+from mapstream.streams.arrays import IntArray
 from mapstream.streams.geometry import (
     invert,
     quat_xyzw_from_rotation,
     rotation_from_quat_xyzw,
 )
-from mapstream.streams.messages.sensors import IntArray
 
 
 def without_vertices(map_: Map, keep: BoolArray) -> Map:

@@ -17,9 +17,9 @@ from mapstream.recordings.maps.model import TABLES, Map, from_tables
 from mapstream.recordings.maps.order import in_canonical_order
 from mapstream.recordings.maps.rows import concatenate, shifted, table_digest
 from mapstream.recordings.maps.tables import BoolArray, Frames, IdArray, Journal, references_of
+from mapstream.streams.arrays import IntArray
 from mapstream.streams.errors import MapError
 from mapstream.streams.geometry import invert
-from mapstream.streams.messages.sensors import IntArray
 
 _WITH_IDS = ("missions", "frames", "vertices", "landmarks", "edges", "resources")
 _PARTS = (("imu", "edge"), ("observations", "vertex"))  # go with what they are a part of

@@ -24,8 +24,8 @@ from mapstream.recordings.maps.model import Map
 from mapstream.recordings.maps.rows import concatenate, take
 from mapstream.recordings.maps.structure_rules import components
 from mapstream.recordings.maps.tables import Edges
+from mapstream.streams.arrays import IntArray
 from mapstream.streams.errors import MapError
-from mapstream.streams.messages.sensors import IntArray
 
 _MAX_NS = 2**63 - 1
 

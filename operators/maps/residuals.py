@@ -7,8 +7,8 @@ import numpy as np
 from mapstream.operators.estimation.outliers.consistency import mahalanobis
 from mapstream.recordings.maps.edge_kinds import RELATIVE_KINDS
 from mapstream.recordings.maps.model import Map
+from mapstream.streams.arrays import FloatArray, IntArray
 from mapstream.streams.geometry import invert, se3_log
-from mapstream.streams.messages.sensors import FloatArray, IntArray
 
 
 def relative_edges(map_: Map, kinds: tuple[str, ...] = RELATIVE_KINDS) -> IntArray:

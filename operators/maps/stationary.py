@@ -15,8 +15,8 @@ from mapstream.recordings.maps.build import append_edges
 from mapstream.recordings.maps.edge_kinds import MOTION_KINDS
 from mapstream.recordings.maps.model import Map
 from mapstream.recordings.maps.tables import Edges
+from mapstream.streams.arrays import FloatArray, IntArray
 from mapstream.streams.geometry import invert, so3_log
-from mapstream.streams.messages.sensors import FloatArray, IntArray
 
 SOURCE = "stationary"
 

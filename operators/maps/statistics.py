@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from mapstream.recordings.maps.model import Map
-from mapstream.streams.messages.sensors import FloatArray, IntArray
+from mapstream.streams.arrays import FloatArray, IntArray
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -15,11 +15,11 @@ from itertools import pairwise
 import numpy as np
 
 from mapstream.operators.odometry.uncertainty import chain, unmeasured
+from mapstream.streams.arrays import FloatArray
 from mapstream.streams.errors import EstimationError
 from mapstream.streams.geometry import SE3
 from mapstream.streams.join import END
 from mapstream.streams.messages.estimates import Odometry
-from mapstream.streams.messages.sensors import FloatArray
 
 
 @dataclass(frozen=True, slots=True, eq=False)

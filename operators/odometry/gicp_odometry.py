@@ -25,11 +25,12 @@ from mapstream.operators.odometry.scan_matcher import ScanMatcher
 from mapstream.operators.odometry.scan_motion import Sweep, is_plausible
 from mapstream.operators.odometry.uncertainty import unmeasured
 from mapstream.operators.operator import Operator, OperatorConfig, Placement, offload, warn
+from mapstream.streams.arrays import FloatArray
 from mapstream.streams.channel import Receiver, Sender
 from mapstream.streams.errors import EstimationError
 from mapstream.streams.geometry import SE3
 from mapstream.streams.messages.estimates import Odometry, PointCloud
-from mapstream.streams.messages.sensors import FloatArray, ImuBatch, LidarScan
+from mapstream.streams.messages.sensors import ImuBatch, LidarScan
 from mapstream.streams.trajectory import Trajectory
 
 _BEND_LIMIT_M = 0.01  # about the noise of a range

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from mapstream.operators.lidar.deskew import gyro_trajectory
 from mapstream.operators.operator import warn
+from mapstream.streams.arrays import FloatArray
 from mapstream.streams.channel import Receiver
-from mapstream.streams.messages.sensors import FloatArray, ImuBatch
+from mapstream.streams.messages.sensors import ImuBatch
 from mapstream.streams.trajectory import Trajectory
 
 

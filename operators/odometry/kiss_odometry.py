@@ -16,11 +16,12 @@ from mapstream.operators.odometry.kiss_tracker import KissTracker, Limits
 from mapstream.operators.odometry.scan_motion import Sweep
 from mapstream.operators.odometry.uncertainty import diagonal, unmeasured
 from mapstream.operators.operator import Operator, OperatorConfig, Placement, offload, warn
+from mapstream.streams.arrays import FloatArray
 from mapstream.streams.channel import Receiver, Sender
 from mapstream.streams.errors import EstimationError
 from mapstream.streams.geometry import SE3
 from mapstream.streams.messages.estimates import Odometry, PointCloud
-from mapstream.streams.messages.sensors import FloatArray, LidarScan
+from mapstream.streams.messages.sensors import LidarScan
 
 _VOXEL_PER_RANGE = 0.1  # of the median range: a metre in a street
 _FINEST_M, _COARSEST_M = 0.5, 1.0  # finer costs three times as much and drifts no less

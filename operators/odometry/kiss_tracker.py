@@ -10,9 +10,9 @@ from kiss_icp.kiss_icp import KissICP
 
 from mapstream.operators.odometry.recent_voxels import RecentVoxels
 from mapstream.operators.odometry.scan_motion import Sweep, is_plausible
+from mapstream.streams.arrays import FloatArray
 from mapstream.streams.errors import EstimationError
 from mapstream.streams.geometry import SE3
-from mapstream.streams.messages.sensors import FloatArray
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -7,8 +7,8 @@ from collections import deque
 import numpy as np
 
 from mapstream.operators.lidar.sampling import voxel_indices
+from mapstream.streams.arrays import FloatArray
 from mapstream.streams.geometry import SE3
-from mapstream.streams.messages.sensors import FloatArray
 
 
 class LocalMap:

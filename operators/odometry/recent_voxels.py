@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from mapstream.operators.lidar.sampling import voxel_keys
-from mapstream.streams.messages.sensors import FloatArray, IntArray
+from mapstream.streams.arrays import FloatArray, IntArray
 
 
 class RecentVoxels:

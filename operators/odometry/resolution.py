@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from mapstream.streams.messages.sensors import FloatArray
+from mapstream.streams.arrays import FloatArray
 
 _PER_RANGE = 0.04  # of the median range: 8 m of room give 0.3 m
 _FINEST_M, _COARSEST_M = 0.1, 0.5

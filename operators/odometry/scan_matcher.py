@@ -7,9 +7,9 @@ from collections.abc import Iterator
 import numpy as np
 
 from mapstream.operators.lidar.registration import Registration, RegistrationResult
+from mapstream.streams.arrays import FloatArray
 from mapstream.streams.errors import EstimationError
 from mapstream.streams.geometry import SE3
-from mapstream.streams.messages.sensors import FloatArray
 
 _SEARCH_YAW_DEG = (0.0, 25.0, -25.0, 50.0, -50.0)
 _SURE_INLIER_FRACTION = 0.75  # of a good prediction, refined over a short distance

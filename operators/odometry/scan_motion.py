@@ -8,15 +8,10 @@ import numpy as np
 import numpy.typing as npt
 
 from mapstream.operators.lidar.sampling import usable, voxel_indices
+from mapstream.streams.arrays import Float32Array, FloatArray, IntArray
 from mapstream.streams.geometry import SE3
 from mapstream.streams.messages.estimates import PointCloud
-from mapstream.streams.messages.sensors import (
-    Float32Array,
-    FloatArray,
-    IntArray,
-    LidarScan,
-    RecordRef,
-)
+from mapstream.streams.messages.sensors import LidarScan, RecordRef
 
 MAX_RANGE_M = 1e6  # beyond it nothing is a return
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from mapstream.streams.arrays import FloatArray
 from mapstream.streams.geometry import SE3
-from mapstream.streams.messages.sensors import FloatArray
 
 UNMEASURED_SIGMAS = (0.5, 0.5, 0.5, 5.0, 5.0, 5.0)  # [rad, m] of a predicted step, per second
 

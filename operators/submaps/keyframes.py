@@ -9,10 +9,10 @@ import numpy as np
 from pydantic import PositiveFloat
 
 from mapstream.operators.operator import Operator, OperatorConfig, report_loss, warn
+from mapstream.streams.arrays import FloatArray
 from mapstream.streams.channel import Receiver, Sender
 from mapstream.streams.errors import EstimationError
 from mapstream.streams.messages.estimates import Keyframe, Odometry, PointCloud
-from mapstream.streams.messages.sensors import FloatArray
 from mapstream.streams.sync import exact
 from mapstream.streams.triggers import AnyOf, OnMotion, Periodic, Trigger
 

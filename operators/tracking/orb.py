@@ -10,8 +10,8 @@ from pydantic import Field, PositiveInt
 
 from mapstream.operators.operator import Operator, OperatorConfig, pipeline
 from mapstream.streams.channel import Receiver, Sender
-from mapstream.streams.messages.estimates import ImageFeatures
 from mapstream.streams.messages.sensors import CameraFrame
+from mapstream.streams.messages.vision import ImageFeatures
 
 _DESCRIPTOR_BYTES = 32
 

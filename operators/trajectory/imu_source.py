@@ -8,9 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from mapstream.streams.arrays import FloatArray
 from mapstream.streams.geometry import SE3, so3_exp
 from mapstream.streams.join import END
-from mapstream.streams.messages.sensors import FloatArray, ImuBatch
+from mapstream.streams.messages.sensors import ImuBatch
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -19,9 +19,9 @@ from mapstream.operators.trajectory.sources import (
     covariance_of,
     identity_motion,
 )
+from mapstream.streams.arrays import FloatArray
 from mapstream.streams.geometry import SE3
 from mapstream.streams.messages.estimates import Odometry
-from mapstream.streams.messages.sensors import FloatArray
 
 WEAK: AxisSigmas = dict.fromkeys(
     AXES, 100.0

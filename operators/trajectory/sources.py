@@ -10,9 +10,10 @@ from typing import Literal, Protocol
 import numpy as np
 
 from mapstream.operators.odometry.continuous import ContinuousSource, Motion
+from mapstream.streams.arrays import FloatArray
 from mapstream.streams.geometry import SE3
 from mapstream.streams.messages.estimates import Odometry
-from mapstream.streams.messages.sensors import FloatArray, WheelOdometry
+from mapstream.streams.messages.sensors import WheelOdometry
 
 EdgeKind = Literal["odometry", "wheel", "motion_model"]
 AXES = ("roll", "pitch", "yaw", "x", "y", "z")  # in the order of tangent vectors

@@ -10,8 +10,9 @@ from pathlib import Path
 import numpy as np
 
 from mapstream.recordings.mcap_writer import McapWriter
+from mapstream.streams.arrays import Float32Array, FloatArray, IntArray
 from mapstream.streams.errors import RecordingError
-from mapstream.streams.messages.sensors import Float32Array, FloatArray, ImuBatch, IntArray, Message
+from mapstream.streams.messages.sensors import ImuBatch, Message
 
 Progress = Callable[[float], None]  # told the fraction done
 Topical = tuple[str, Message]  # a message and its topic

@@ -22,10 +22,11 @@ from mapstream.recordings.datasets.conversion import (
 )
 from mapstream.recordings.mcap_writer import McapWriter
 from mapstream.recordings.trajectory_files import KITTI_PERIOD_NS, read_kitti, read_times
+from mapstream.streams.arrays import IntArray
 from mapstream.streams.errors import RecordingError
 from mapstream.streams.geometry import SE3
 from mapstream.streams.messages.estimates import Odometry
-from mapstream.streams.messages.sensors import IntArray, LidarScan
+from mapstream.streams.messages.sensors import LidarScan
 
 _FRAME = "velodyne"
 

@@ -31,11 +31,11 @@ from mapstream.recordings.datasets.conversion import (
 from mapstream.recordings.maps.ids import derived_id
 from mapstream.recordings.mcap_writer import McapWriter
 from mapstream.recordings.number_tables import read_table
+from mapstream.streams.arrays import FloatArray
 from mapstream.streams.errors import RecordingError
 from mapstream.streams.geometry import SE3, quat_xyzw_from_rotation
 from mapstream.streams.messages.constraints import Constraint, OuterFrame
 from mapstream.streams.messages.estimates import Odometry
-from mapstream.streams.messages.sensors import FloatArray
 from mapstream.streams.rig import Extrinsics, Rig
 from mapstream.streams.sensors import ImuNoise, ImuSensor
 

@@ -16,7 +16,8 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
-from mapstream.streams.messages.sensors import Float32Array, IntArray, LidarScan
+from mapstream.streams.arrays import Float32Array, IntArray
+from mapstream.streams.messages.sensors import LidarScan
 
 INTENSITY: Final = ("intensity", "intensities", "reflectivity", "i", "signal")
 RING: Final = ("ring", "line", "channel", "laser_id", "laserid", "row")

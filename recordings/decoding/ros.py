@@ -11,10 +11,10 @@ from functools import cache
 import numpy as np
 
 from mapstream.recordings.decoding.cursor import CdrCursor
+from mapstream.streams.arrays import FloatArray
 from mapstream.streams.geometry import SE3
 from mapstream.streams.messages.estimates import Odometry
 from mapstream.streams.messages.sensors import (
-    FloatArray,
     GnssFix,
     ImuBatch,
     LaserScan2D,

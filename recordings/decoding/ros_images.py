@@ -6,8 +6,9 @@ import numpy as np
 import numpy.typing as npt
 
 from mapstream.recordings.decoding.cursor import CdrCursor
+from mapstream.streams.arrays import FloatArray
 from mapstream.streams.calibration import CameraCalibration, Distortion
-from mapstream.streams.messages.sensors import CameraFrame, EncodedImage, FloatArray
+from mapstream.streams.messages.sensors import CameraFrame, EncodedImage
 
 # encoding in ROS -> dtype, channels, encoding of ours
 _ENCODINGS = {

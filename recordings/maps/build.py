@@ -14,10 +14,11 @@ from mapstream.recordings.maps.ids import derived_id, id_array, id_bytes
 from mapstream.recordings.maps.model import Map
 from mapstream.recordings.maps.rows import concatenate, take
 from mapstream.recordings.maps.tables import Edges, Missions, Resources
+from mapstream.streams.arrays import IntArray
 from mapstream.streams.errors import MapError
 from mapstream.streams.geometry import SE3
 from mapstream.streams.messages.estimates import RelativePose
-from mapstream.streams.messages.sensors import IntArray, RecordRef
+from mapstream.streams.messages.sensors import RecordRef
 
 
 def new_mission(map_: Map, mission_id: str, *, name: str = "", sensors: str = "{}") -> Map:

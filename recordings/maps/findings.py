@@ -9,7 +9,7 @@ import numpy as np
 
 from mapstream.recordings.maps.model import Map
 from mapstream.recordings.maps.tables import BoolArray
-from mapstream.streams.messages.sensors import IntArray
+from mapstream.streams.arrays import IntArray
 
 Sentence = str | Callable[[int], str]  # one for all rows, or made for a row
 

@@ -29,9 +29,9 @@ from mapstream.recordings.maps.tables import (
     Table,
     Vertices,
 )
+from mapstream.streams.arrays import FloatArray, IntArray
 from mapstream.streams.errors import MapError
 from mapstream.streams.geometry import rotation_from_quat_xyzw
-from mapstream.streams.messages.sensors import FloatArray, IntArray
 from mapstream.streams.trajectory import Trajectory
 
 

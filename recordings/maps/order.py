@@ -13,7 +13,7 @@ from mapstream.recordings.maps.ids import as_keys
 from mapstream.recordings.maps.model import Map, from_tables
 from mapstream.recordings.maps.rows import take
 from mapstream.recordings.maps.tables import Edges, references_of
-from mapstream.streams.messages.sensors import IntArray
+from mapstream.streams.arrays import IntArray
 
 
 def in_canonical_order(map_: Map) -> Map:

@@ -18,7 +18,7 @@ from mapstream.recordings.maps.tables import (
     columns_of,
     references_of,
 )
-from mapstream.streams.messages.sensors import IntArray
+from mapstream.streams.arrays import IntArray
 
 
 def take(table: TableT, rows: npt.NDArray[np.integer[Any]] | BoolArray) -> TableT:

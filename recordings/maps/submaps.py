@@ -13,10 +13,11 @@ from mapstream.recordings.maps.ids import id_array, vertex_id
 from mapstream.recordings.maps.model import Map
 from mapstream.recordings.maps.rows import concatenate
 from mapstream.recordings.maps.tables import ImuSamples, Vertices
+from mapstream.streams.arrays import FloatArray
 from mapstream.streams.errors import MapError
 from mapstream.streams.geometry import SE3
 from mapstream.streams.messages.estimates import Keyframe, RelativePose, Splice, Submap
-from mapstream.streams.messages.sensors import FloatArray, ImuBatch
+from mapstream.streams.messages.sensors import ImuBatch
 
 CONTINUOUS_KINDS = ("odometry", "wheel", "motion_model", "imu")
 """Edges that a source of motion gives for any interval, so that a new pose inside it splits them."""

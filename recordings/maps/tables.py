@@ -17,9 +17,8 @@ from typing import Any, ClassVar, TypeVar
 import numpy as np
 import numpy.typing as npt
 
-from mapstream.streams.arrays import frozen
+from mapstream.streams.arrays import Float32Array, FloatArray, IntArray, frozen
 from mapstream.streams.geometry import SE3
-from mapstream.streams.messages.sensors import Float32Array, FloatArray, IntArray
 
 IdArray = npt.NDArray[np.uint8]
 BoolArray = npt.NDArray[np.bool_]

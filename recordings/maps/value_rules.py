@@ -13,7 +13,7 @@ import numpy.typing as npt
 from mapstream.recordings.maps.findings import Finding, Rule, where
 from mapstream.recordings.maps.model import Map
 from mapstream.recordings.maps.tables import BoolArray, TextArray, columns_of
-from mapstream.streams.messages.sensors import FloatArray
+from mapstream.streams.arrays import FloatArray
 
 _ROTATION_TOLERANCE = 1e-6  # poses that were composed thousands of times stay below it
 _COVARIANCE_TOLERANCE = 1e-9  # relative: what inverting an information matrix leaves

@@ -12,8 +12,8 @@ import numpy as np
 
 from mapstream.recordings.worlds.mesh import Mesh, box, join, sheet
 from mapstream.recordings.worlds.ring import Ring
+from mapstream.streams.arrays import Float32Array, FloatArray
 from mapstream.streams.geometry import SE3, so3_exp
-from mapstream.streams.messages.sensors import Float32Array, FloatArray
 
 _GRID_M = 0.5
 _EDGE_M = 0.01  # half the thickness of a step in a wall

@@ -10,7 +10,8 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, NonNegativeFloat, PositiveFloat, PositiveInt
 
 from mapstream.recordings.worlds.ray_caster import RayCaster
-from mapstream.streams.messages.sensors import FloatArray, LidarScan
+from mapstream.streams.arrays import FloatArray
+from mapstream.streams.messages.sensors import LidarScan
 
 
 class DepthCameraConfig(BaseModel):

@@ -8,9 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from mapstream.streams.arrays import frozen
+from mapstream.streams.arrays import Float32Array, FloatArray, IntArray, frozen
 from mapstream.streams.geometry import SE3
-from mapstream.streams.messages.sensors import Float32Array, FloatArray, IntArray
 
 _BOX_CORNERS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]) / 2
 _BOX_FACES = np.array(

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from mapstream.streams.arrays import FloatArray, IntArray
 from mapstream.streams.geometry import SE3, so3_log
-from mapstream.streams.messages.sensors import FloatArray, IntArray
 
 GRAVITY_MPS2 = 9.81
 _DEGREE = 5  # acceleration and its first two derivatives are continuous

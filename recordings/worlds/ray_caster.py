@@ -12,7 +12,7 @@ import igl
 import numpy as np
 
 from mapstream.recordings.worlds.mesh import Mesh
-from mapstream.streams.messages.sensors import FloatArray, IntArray
+from mapstream.streams.arrays import FloatArray, IntArray
 
 _REACH_M = 12.0  # of the trees of what is near
 _SLACK_M = np.array([2.0, 2.0, 0.2])  # how far origins may move; robots drive on floors

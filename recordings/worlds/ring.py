@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from mapstream.streams.messages.sensors import FloatArray
+from mapstream.streams.arrays import FloatArray
 
 MIN_LENGTH_M = 36.0  # below it the corners leave no room for the corridor's inner wall
 _MAX_RADIUS_M = 8.0

@@ -9,9 +9,10 @@ from pydantic import BaseModel, ConfigDict, NonNegativeFloat, PositiveFloat, Pos
 
 from mapstream.recordings.worlds.motion import Motion
 from mapstream.recordings.worlds.ray_caster import RayCaster
+from mapstream.streams.arrays import FloatArray, IntArray
 from mapstream.streams.geometry import SE3, invert, se3_exp
 from mapstream.streams.messages.estimates import Odometry
-from mapstream.streams.messages.sensors import FloatArray, ImuBatch, IntArray, LidarScan
+from mapstream.streams.messages.sensors import ImuBatch, LidarScan
 
 
 class LidarConfig(BaseModel):

@@ -19,9 +19,9 @@ from mapstream.recordings.worlds.sensors import (
     imu_batches,
 )
 from mapstream.recordings.worlds.simulation import Record, Simulation
+from mapstream.streams.arrays import FloatArray
 from mapstream.streams.geometry import SE3, so3_exp
 from mapstream.streams.messages.estimates import Odometry
-from mapstream.streams.messages.sensors import FloatArray
 
 START_NS = 1_700_000_000 * 10**9
 # Turned, so that a forgotten extrinsic shows; level, or point-to-point ICP would climb along the rings.

@@ -16,14 +16,10 @@ from mapstream.recordings.worlds.depth_camera import DepthCamera, DepthCameraCon
 from mapstream.recordings.worlds.motion import Motion
 from mapstream.recordings.worlds.ray_caster import RayCaster
 from mapstream.recordings.worlds.simulation import Record, Simulation
+from mapstream.streams.arrays import FloatArray, IntArray
 from mapstream.streams.geometry import SE3
 from mapstream.streams.messages.estimates import Odometry
-from mapstream.streams.messages.sensors import (
-    FloatArray,
-    IntArray,
-    LidarScan,
-    TransformBatch,
-)
+from mapstream.streams.messages.sensors import LidarScan, TransformBatch
 
 START_NS = 1_700_000_000 * 10**9
 BASE, MAST, HEAD, CAMERA = "base_link", "mast", "head", "depth"

@@ -6,9 +6,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from mapstream.streams.arrays import frozen, frozen_optional
+from mapstream.streams.arrays import FloatArray, frozen, frozen_optional
 from mapstream.streams.geometry import SE3
-from mapstream.streams.messages.sensors import FloatArray
 
 
 def _unmeasured() -> FloatArray:

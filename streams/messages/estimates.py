@@ -7,21 +7,15 @@ A mission is named by 32 hex digits; with a stamp they name one vertex.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
-import numpy.typing as npt
 
-from mapstream.streams.arrays import frozen, frozen_optional
+from mapstream.streams.arrays import Float32Array, FloatArray, IntArray, frozen, frozen_optional
 from mapstream.streams.geometry import SE3
 from mapstream.streams.messages.constraints import Constraint
-from mapstream.streams.messages.sensors import (
-    Float32Array,
-    FloatArray,
-    ImuBatch,
-    IntArray,
-    RecordRef,
-)
+from mapstream.streams.messages.sensors import ImuBatch, RecordRef
+from mapstream.streams.messages.vision import ImageFeatures
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -102,6 +96,7 @@ class Keyframe:
     odometry: Odometry
     cloud: PointCloud | None = None
     records: tuple[RecordRef, ...] = ()  # the raw measurements, where they lie
+    features: tuple[ImageFeatures, ...] = ()  # of all cameras, of all kinds
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -165,23 +160,3 @@ class MapCorrection:
     def __post_init__(self) -> None:
         n = frozen(self, "stamps_ns", np.int64, (None,)).shape[0]
         frozen(self, "T_mission_base", np.float64, (n, 4, 4))
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class ImageFeatures:
-    """Keypoints of one image with their descriptors."""
-
-    stamp_ns: int
-    kind: str  # orb, brisk, sift ...; features of different kinds never meet
-    frame: str
-    keypoints_px: Float32Array  # (N, 2) x, y
-    descriptors: npt.NDArray[Any]  # (N, D) uint8 bits or float32
-    scores: Float32Array | None = None  # (N,)
-    scales: Float32Array | None = None  # (N,) diameter [px]
-    orientations_rad: Float32Array | None = None  # (N,)
-
-    def __post_init__(self) -> None:
-        n = frozen(self, "keypoints_px", np.float32, (None, 2)).shape[0]
-        frozen(self, "descriptors", self.descriptors.dtype, (n, None))
-        for name in ("scores", "scales", "orientations_rad"):
-            frozen_optional(self, name, np.float32, (n,))

@@ -13,12 +13,15 @@ from typing import Any, Protocol
 import numpy as np
 import numpy.typing as npt
 
-from mapstream.streams.arrays import frozen, frozen_optional
+from mapstream.streams.arrays import (
+    Float32Array,
+    FloatArray,
+    IntArray,
+    frozen,
+    frozen_optional,
+)
+from mapstream.streams.calibration import CameraCalibration
 from mapstream.streams.geometry import SE3
-
-FloatArray = npt.NDArray[np.float64]
-Float32Array = npt.NDArray[np.float32]
-IntArray = npt.NDArray[np.int64]
 
 
 class Message(Protocol):
@@ -72,6 +75,7 @@ class CameraFrame:
     encoding: str  # as in ROS: mono8, bgr8, rgb8, mono16, 16UC1 [mm], 32FC1 [m]
     frame: str = "camera"
     T_base_sensor: SE3 = field(default_factory=SE3.identity)
+    camera: CameraCalibration | None = None  # where a rig's file or a topic described it
     record: RecordRef | None = None
 
     def __post_init__(self) -> None:
@@ -88,6 +92,7 @@ class EncodedImage:
     format: str  # jpeg, png, ...
     frame: str = "camera"
     T_base_sensor: SE3 = field(default_factory=SE3.identity)
+    camera: CameraCalibration | None = None  # where a rig's file or a topic described it
     record: RecordRef | None = None
 
     def __post_init__(self) -> None:

@@ -12,7 +12,6 @@ from mapstream.recordings.maps.build import add_edges
 from mapstream.recordings.maps.submaps import append_submap
 from mapstream.streams.geometry import SE3
 from mapstream.streams.messages.estimates import (
-    ImageFeatures,
     Keyframe,
     LoopCandidate,
     LoopReport,
@@ -32,6 +31,7 @@ from mapstream.streams.messages.sensors import (
     TransformBatch,
     WheelOdometry,
 )
+from mapstream.streams.messages.vision import ImageFeatures
 
 MISSION = "ab" * 16
 STEP_NS = 100_000_000

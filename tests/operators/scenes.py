@@ -3,8 +3,9 @@
 import numpy as np
 import numpy.typing as npt
 
+from mapstream.streams.arrays import FloatArray
 from mapstream.streams.geometry import SE3
-from mapstream.streams.messages.sensors import FloatArray, LidarScan
+from mapstream.streams.messages.sensors import LidarScan
 
 
 def room(seed: int = 0, num_points: int = 6000, boxes: int = 12) -> FloatArray:

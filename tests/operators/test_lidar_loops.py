@@ -12,6 +12,7 @@ from mapstream.operators.lidar.loops import Inputs, LidarLoops, LidarLoopsConfig
 from mapstream.operators.lidar.surroundings import Surroundings
 from mapstream.operators.lidar.trail import Reach, Trail
 from mapstream.operators.testing import run_operator
+from mapstream.streams.arrays import FloatArray
 from mapstream.streams.channel import Channel, Limits, Receiver, Sender
 from mapstream.streams.geometry import SE3
 from mapstream.streams.messages.estimates import (
@@ -22,7 +23,6 @@ from mapstream.streams.messages.estimates import (
     PointCloud,
     Submap,
 )
-from mapstream.streams.messages.sensors import FloatArray
 from tests.operators.scenes import room, seen_from
 
 pytestmark = pytest.mark.anyio

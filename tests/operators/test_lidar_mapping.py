@@ -25,10 +25,10 @@ from mapstream.recordings.maps.check import check_map
 from mapstream.recordings.maps.model import Map
 from mapstream.recordings.worlds.sensors import LidarConfig
 from mapstream.recordings.worlds.w_lid import WLidConfig, w_lid
+from mapstream.streams.arrays import FloatArray
 from mapstream.streams.channel import Channel, Limits, Receiver, Sender
 from mapstream.streams.geometry import SE3
 from mapstream.streams.messages.estimates import Odometry, PointCloud, Submap
-from mapstream.streams.messages.sensors import FloatArray
 from mapstream.streams.trajectory import Trajectory
 
 pytestmark = [pytest.mark.anyio, pytest.mark.slow]

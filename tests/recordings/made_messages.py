@@ -14,7 +14,6 @@ from mapstream.streams.messages.constraints import (
     OuterFrame,
 )
 from mapstream.streams.messages.estimates import (
-    ImageFeatures,
     Keyframe,
     LoopCandidate,
     LoopReport,
@@ -36,6 +35,7 @@ from mapstream.streams.messages.sensors import (
     TransformBatch,
     WheelOdometry,
 )
+from mapstream.streams.messages.vision import ImageFeatures, NFrame
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -108,6 +108,18 @@ def one_of_each(seed: int) -> list[Any]:
         stamps_ns=np.arange(n + 1), gyro_radps=rng.normal(size=(n + 1, 3)),
         accel_mps2=rng.normal(size=(n + 1, 3)), is_saturated=maybe(np.zeros(n + 1, bool)),
     )  # fmt: skip
+    camera = CameraCalibration(
+        stamp_ns=stamp, width_px=640, height_px=480, focal_px=rng.random(2) + 400,
+        center_px=rng.random(2) + 200, distortion="radtan", distortion_parameters=rng.random(4),
+    )  # fmt: skip
+    features = ImageFeatures(
+        stamp_ns=stamp, kind="orb", frame="camera",
+        keypoints_px=rng.random((n, 2)).astype(np.float32),
+        descriptors=rng.integers(0, 255, (n, 32), np.uint8), scores=maybe(intensity),
+        sigmas_px=maybe(intensity), track_ids=maybe(np.arange(n) - 1),
+        points_m=maybe(rng.random((n, 3)).astype(np.float32)), offsets_ns=maybe(np.arange(n)),
+        T_base_sensor=pose(), camera=maybe(camera), record=maybe(ref),
+    )  # fmt: skip
     return [
         loop,
         LidarScan(
@@ -129,10 +141,7 @@ def one_of_each(seed: int) -> list[Any]:
             stamp_ns=stamp, latitude_deg=47.1, longitude_deg=8.2, altitude_m=-0.0,
             covariance_enu_m2=maybe(np.eye(3)),
         ),
-        CameraCalibration(
-            stamp_ns=stamp, width_px=640, height_px=480, focal_px=rng.random(2) + 400,
-            center_px=rng.random(2) + 200, distortion="radtan", distortion_parameters=rng.random(4),
-        ),
+        camera,
         WheelOdometry(stamp_ns=stamp, T_odom_base=pose(), covariance=maybe(covariance())),
         TransformBatch(
             stamps_ns=np.arange(2), parents=("a", "b"), children=("c", "d"),
@@ -152,9 +161,6 @@ def one_of_each(seed: int) -> list[Any]:
             T_mission_base=np.array([pose().matrix for _ in range(n)]).reshape(n, 4, 4),
             T_mission_odom=pose(), T_map_mission=maybe(pose()),
         ),
-        ImageFeatures(
-            stamp_ns=stamp, kind="orb", frame="camera",
-            keypoints_px=rng.random((n, 2)).astype(np.float32),
-            descriptors=rng.integers(0, 255, (n, 32), np.uint8), scores=maybe(intensity),
-        ),
+        features,
+        NFrame(stamp_ns=stamp, features=(features,) * n),
     ]  # fmt: skip

@@ -19,9 +19,9 @@ from mapstream.recordings.evaluation import (
     rpe,
 )
 from mapstream.recordings.trajectory_files import read_tum
+from mapstream.streams.arrays import FloatArray
 from mapstream.streams.errors import EstimationError
 from mapstream.streams.geometry import se3_exp, so3_exp
-from mapstream.streams.messages.sensors import FloatArray
 from mapstream.streams.trajectory import Trajectory
 
 GOLDEN = Path(__file__).parent / "golden"

@@ -16,8 +16,8 @@ from mapstream.operators.maps import edit as tools
 from mapstream.operators.maps.missions import find_mission
 from mapstream.recordings.maps import Map
 from mapstream.recordings.maps.history import change_map
+from mapstream.streams.arrays import IntArray
 from mapstream.streams.errors import ConfigError
-from mapstream.streams.messages.sensors import IntArray
 
 edit = typer.Typer(help="Edit the pose graph by hand.", no_args_is_help=True, rich_markup_mode=None)
 KindOption = Annotated[str | None, typer.Option(help="Edges of this kind.")]

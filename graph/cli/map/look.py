@@ -20,7 +20,7 @@ from mapstream.graph.cli.output import (
 )
 from mapstream.operators.maps.statistics import map_statistics
 from mapstream.recordings.maps import check_map, load_map
-from mapstream.streams.messages.sensors import FloatArray
+from mapstream.streams.arrays import FloatArray
 
 
 def check(context: typer.Context, *, json: JsonFlag = False) -> None:

@@ -21,9 +21,9 @@ from mapstream.operators.estimation.factors.payloads import number_of, payloads
 from mapstream.operators.estimation.keys import key_of
 from mapstream.operators.estimation.noise import Factor, NoiseModels
 from mapstream.recordings.maps.model import Map
+from mapstream.streams.arrays import FloatArray, IntArray
 from mapstream.streams.errors import EstimationError
 from mapstream.streams.geometry import SE3
-from mapstream.streams.messages.sensors import FloatArray, IntArray
 
 _IDENTITY = np.eye(4)
 _UP = gtsam.Unit3(np.array([0.0, 0.0, 1.0]))

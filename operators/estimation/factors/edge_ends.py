@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from mapstream.recordings.maps.model import Map
+from mapstream.streams.arrays import IntArray
 from mapstream.streams.errors import EstimationError
-from mapstream.streams.messages.sensors import IntArray
 
 
 def edge_name(map_: Map, row: int) -> str:

@@ -21,8 +21,8 @@ from mapstream.operators.estimation.keys import key_of
 from mapstream.operators.estimation.noise import Factor, NoiseModels
 from mapstream.operators.imu.parameters import ImuParameters
 from mapstream.recordings.maps.model import Map
+from mapstream.streams.arrays import FloatArray, IntArray
 from mapstream.streams.errors import EstimationError
-from mapstream.streams.messages.sensors import FloatArray, IntArray
 
 _SATURATED = 100.0  # times the noise of a sample that hit its limit
 _MAX_GAP_NS = 1_000_000_000  # without a sample; whoever makes edges may ask for less

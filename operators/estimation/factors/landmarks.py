@@ -20,7 +20,7 @@ from mapstream.operators.estimation.factors.payloads import number_of, payloads
 from mapstream.operators.estimation.keys import key_of
 from mapstream.operators.estimation.noise import Factor, NoiseModels
 from mapstream.recordings.maps.model import Map
-from mapstream.streams.messages.sensors import FloatArray, IntArray
+from mapstream.streams.arrays import FloatArray, IntArray
 
 Shape = Literal["point", "point2d", "pose", "plane"]
 _FAR = 0.003  # sigma by range below which bearing and range are as good as the point

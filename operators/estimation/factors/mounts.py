@@ -17,9 +17,9 @@ import numpy as np
 from mapstream.operators.estimation.factors.payloads import Payload, T_base_sensor_of
 from mapstream.operators.estimation.keys import key_of
 from mapstream.recordings.maps.model import Map
+from mapstream.streams.arrays import FloatArray
 from mapstream.streams.errors import EstimationError
 from mapstream.streams.geometry import SE3
-from mapstream.streams.messages.sensors import FloatArray
 
 _HERE = [0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0]
 

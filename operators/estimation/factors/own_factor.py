@@ -7,7 +7,7 @@ from typing import Any
 
 import gtsam
 
-from mapstream.streams.messages.sensors import FloatArray
+from mapstream.streams.arrays import FloatArray
 
 Residual = Callable[[Any, Sequence[int], list[FloatArray] | None], FloatArray]
 """From gtsam's values, the keys, and a list for the Jacobians by key, to the error (M,).

@@ -9,9 +9,9 @@ import numpy as np
 
 from mapstream.operators.estimation.factors.edge_ends import edge_name
 from mapstream.recordings.maps.model import Map
+from mapstream.streams.arrays import FloatArray, IntArray
 from mapstream.streams.errors import EstimationError
 from mapstream.streams.geometry import SE3
-from mapstream.streams.messages.sensors import FloatArray, IntArray
 
 Payload = dict[str, Any]
 _IDENTITY = np.eye(4)

@@ -13,8 +13,8 @@ import numpy as np
 from mapstream.operators.estimation.keys import key_of
 from mapstream.operators.estimation.noise import Factor, NoiseModels
 from mapstream.recordings.maps.model import Map
+from mapstream.streams.arrays import FloatArray, IntArray
 from mapstream.streams.geometry import so3_exp
-from mapstream.streams.messages.sensors import FloatArray, IntArray
 
 _MEASURED = [0, 1, 5]  # of the tangent of a pose on the plane
 

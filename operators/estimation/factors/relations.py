@@ -17,9 +17,9 @@ from mapstream.operators.estimation.factors.own_factor import OwnFactor, Residua
 from mapstream.operators.estimation.keys import key_of
 from mapstream.operators.estimation.noise import Factor, NoiseModels
 from mapstream.recordings.maps.model import Map
+from mapstream.streams.arrays import FloatArray, IntArray
 from mapstream.streams.errors import EstimationError
 from mapstream.streams.geometry import hat
-from mapstream.streams.messages.sensors import FloatArray, IntArray
 
 
 class _Plane:

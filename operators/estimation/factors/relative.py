@@ -7,7 +7,7 @@ import gtsam
 from mapstream.operators.estimation.factors.edge_ends import require_ends
 from mapstream.operators.estimation.noise import Factor, NoiseModels
 from mapstream.recordings.maps.model import Map
-from mapstream.streams.messages.sensors import IntArray
+from mapstream.streams.arrays import IntArray
 
 
 def between(map_: Map, rows: IntArray, noise_of: NoiseModels) -> dict[int, Factor]:

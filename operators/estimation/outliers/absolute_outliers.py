@@ -15,7 +15,7 @@ from pydantic import BaseModel, ConfigDict, PositiveFloat, PositiveInt
 
 from mapstream.recordings.maps.model import Map
 from mapstream.recordings.maps.tables import BoolArray
-from mapstream.streams.messages.sensors import FloatArray, IntArray
+from mapstream.streams.arrays import FloatArray, IntArray
 
 _KINDS = ("absolute", "position")
 _LEAST = 3  # fixes below which none can be told to be wrong

@@ -22,8 +22,8 @@ from mapstream.operators.estimation.outliers.consistency import (
 )
 from mapstream.recordings.maps.model import Map
 from mapstream.recordings.maps.tables import BoolArray
+from mapstream.streams.arrays import FloatArray, IntArray
 from mapstream.streams.geometry import invert, se3_log
-from mapstream.streams.messages.sensors import FloatArray, IntArray
 
 _SEEDS = 20  # loops with the most agreeing others, from each of which a set is grown
 _WIDENINGS = (1.0, 4.0, 16.0)  # of the gate, for graphs whose covariances promise too much

@@ -13,8 +13,8 @@ import numpy as np
 
 from mapstream.recordings.maps.edge_kinds import MOTION_KINDS
 from mapstream.recordings.maps.model import Map
+from mapstream.streams.arrays import FloatArray, IntArray
 from mapstream.streams.geometry import hat, invert, se3_log
-from mapstream.streams.messages.sensors import FloatArray, IntArray
 
 
 @dataclass(frozen=True, slots=True)

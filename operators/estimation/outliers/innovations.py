@@ -18,7 +18,7 @@ from mapstream.operators.estimation.incremental import IncrementalProblem, Name
 from mapstream.operators.estimation.noise import Factor
 from mapstream.operators.estimation.outliers.consistency import chi2_gate
 from mapstream.operators.estimation.states import Values
-from mapstream.streams.messages.sensors import FloatArray
+from mapstream.streams.arrays import FloatArray
 
 _CHANCE = 1e-6  # that a true fix is left out; small, since models of an IMU's noise are wrong
 _NEAR_CHI2 = 1.0  # a fix so near the solution is not asked whether it bent it

@@ -13,7 +13,7 @@ from mapstream.operators.estimation.outliers.consistency import chi2_gate
 from mapstream.operators.estimation.starts.first_fixes import inertial_missions
 from mapstream.operators.estimation.states import initial_values
 from mapstream.recordings.maps.model import Map
-from mapstream.streams.messages.sensors import IntArray
+from mapstream.streams.arrays import IntArray
 
 _KINDS = ("position", "absolute")
 _TRUE = 0.9999  # of true fixes are nearer than those that are far off

@@ -21,8 +21,8 @@ from mapstream.operators.estimation.problem import Problem, chi2_of, dimensions
 from mapstream.operators.estimation.solvers import Graph, Limits, Solved, Solver
 from mapstream.operators.estimation.states import Values
 from mapstream.recordings.maps.tables import BoolArray
+from mapstream.streams.arrays import FloatArray
 from mapstream.streams.errors import EstimationError
-from mapstream.streams.messages.sensors import FloatArray
 
 _NEGLIGIBLE = 100.0  # gates: beyond, a loop hardly pulls, and only fills the matrix
 _WIDENINGS = (64.0, 16.0, 4.0)  # of the gate: lets true loops back in that the first solution lost

@@ -16,8 +16,8 @@ from mapstream.operators.estimation.problem import graph_of
 from mapstream.operators.estimation.starts.inertial_start import first_velocity_prior, headings
 from mapstream.operators.estimation.states import initial_values, with_solution
 from mapstream.recordings.maps.model import Map
+from mapstream.streams.arrays import IntArray
 from mapstream.streams.errors import EstimationError
-from mapstream.streams.messages.sensors import IntArray
 
 FEWEST_FIXES = 4
 _MIN_SPREAD_M = 10.0

@@ -16,8 +16,8 @@ from mapstream.operators.estimation.factors.inertial import bias_of
 from mapstream.operators.estimation.keys import key_of
 from mapstream.operators.estimation.noise import Factor
 from mapstream.recordings.maps.model import Map
+from mapstream.streams.arrays import FloatArray, IntArray
 from mapstream.streams.geometry import invert, so3_exp
-from mapstream.streams.messages.sensors import FloatArray, IntArray
 
 _FIRST_VELOCITY_MPS = 50.0  # how fast a robot may be when it begins
 _NUM_HEADINGS = 8

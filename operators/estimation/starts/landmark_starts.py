@@ -13,8 +13,8 @@ import numpy as np
 from mapstream.operators.estimation.factors.landmarks import shape_of
 from mapstream.operators.estimation.factors.mounts import mounts
 from mapstream.recordings.maps.model import Map
+from mapstream.streams.arrays import FloatArray, IntArray
 from mapstream.streams.geometry import invert
-from mapstream.streams.messages.sensors import FloatArray, IntArray
 
 _EDGE_KINDS = ("landmark",)
 

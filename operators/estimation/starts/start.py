@@ -19,8 +19,8 @@ from mapstream.operators.estimation.problem import Problem, graph_of
 from mapstream.operators.estimation.states import Values, initial_values
 from mapstream.recordings.maps.build import with_poses
 from mapstream.recordings.maps.model import Map
+from mapstream.streams.arrays import FloatArray, IntArray
 from mapstream.streams.geometry import invert
-from mapstream.streams.messages.sensors import FloatArray, IntArray
 
 _PLANAR = [2, 3, 4]  # yaw, x, y among the six directions
 _TINY = 1e-12  # of the largest weight; it keeps poses that nothing places from being singular

@@ -22,9 +22,9 @@ from mapstream.recordings.maps.ids import derived_id, id_array, id_bytes, vertex
 from mapstream.recordings.maps.model import Map
 from mapstream.recordings.maps.rows import concatenate
 from mapstream.recordings.maps.tables import Edges, Landmarks, Vertices
+from mapstream.streams.arrays import FloatArray
 from mapstream.streams.geometry import SE3, se3_exp
 from mapstream.streams.messages.constraints import Constraint
-from mapstream.streams.messages.sensors import FloatArray
 
 MISSION = "0f" * 16
 STEP_NS = 500_000_000

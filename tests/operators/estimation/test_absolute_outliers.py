@@ -12,8 +12,8 @@ from mapstream.operators.estimation.outliers.absolute_outliers import reject_abs
 from mapstream.recordings.maps.build import append_edges
 from mapstream.recordings.maps.model import Map
 from mapstream.recordings.maps.tables import BoolArray, Edges
+from mapstream.streams.arrays import FloatArray
 from mapstream.streams.geometry import SE3
-from mapstream.streams.messages.sensors import FloatArray
 from tests.operators.estimation.problems import (
     cov,
     position_errors_m,

@@ -14,8 +14,8 @@ from mapstream.recordings.kimera_multi import read_kimera_multi
 from mapstream.recordings.maps.build import append_edges
 from mapstream.recordings.maps.model import Map
 from mapstream.recordings.maps.tables import Edges
+from mapstream.streams.arrays import FloatArray
 from mapstream.streams.geometry import SE3, invert, se3_exp, se3_log
-from mapstream.streams.messages.sensors import FloatArray
 from tests.data import shared
 from tests.operators.estimation.problems import cov, wander, with_mission, with_relative
 

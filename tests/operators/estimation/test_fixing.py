@@ -19,9 +19,9 @@ from mapstream.operators.estimation.fixing import Fixable
 from mapstream.operators.estimation.kinds import make_factors, makers, register
 from mapstream.operators.estimation.noise import NoiseModels
 from mapstream.recordings.maps.model import Map
+from mapstream.streams.arrays import FloatArray
 from mapstream.streams.geometry import SE3
 from mapstream.streams.messages.constraints import Constraint, LandmarkRef, OuterFrame
-from mapstream.streams.messages.sensors import FloatArray
 from tests.installed import look_installed
 from tests.operators.estimation.problems import (
     STEP_NS,

@@ -21,9 +21,9 @@ from mapstream.operators.estimation.states import initial_values, velocities_of_
 from mapstream.operators.imu.parameters import ImuParameters
 from mapstream.recordings.maps.model import Map
 from mapstream.recordings.maps.tables import ImuSamples
+from mapstream.streams.arrays import FloatArray, IntArray
 from mapstream.streams.errors import EstimationError
 from mapstream.streams.geometry import SE3, rotation_from_quat_xyzw, se3_exp, so3_exp, so3_log
-from mapstream.streams.messages.sensors import FloatArray, IntArray
 from tests.data import shared
 from tests.operators.estimation.problems import (
     Solved,

@@ -14,10 +14,10 @@ from mapstream.operators.estimation.noise import NoiseModels
 from mapstream.operators.estimation.starts.landmark_starts import averaged_landmarks
 from mapstream.recordings.maps.model import Map
 from mapstream.recordings.maps.tables import Observations
+from mapstream.streams.arrays import FloatArray
 from mapstream.streams.errors import EstimationError
 from mapstream.streams.geometry import SE3, se3_exp
 from mapstream.streams.messages.constraints import Constraint, LandmarkRef, OuterFrame
-from mapstream.streams.messages.sensors import FloatArray
 from tests.operators.estimation.problems import (
     STEP_NS,
     Solved,

@@ -11,9 +11,9 @@ from mapstream.operators.estimation.batch import OptimizeConfig, optimize_map
 from mapstream.operators.estimation.covariance import covariances
 from mapstream.operators.estimation.optimize_config import Loss
 from mapstream.recordings.maps.model import Map
+from mapstream.streams.arrays import FloatArray
 from mapstream.streams.errors import EstimationError
 from mapstream.streams.geometry import invert, se3_exp, se3_log
-from mapstream.streams.messages.sensors import FloatArray
 from tests.operators.estimation.problems import (
     cov,
     disturbed,

@@ -14,9 +14,9 @@ import pytest
 from mapstream.operators.estimation.keys import key_of
 from mapstream.operators.estimation.states import initial_values
 from mapstream.recordings.maps.model import Map
+from mapstream.streams.arrays import FloatArray
 from mapstream.streams.geometry import SE3, se3_exp
 from mapstream.streams.messages.constraints import Constraint, OuterFrame
-from mapstream.streams.messages.sensors import FloatArray
 from tests.operators.estimation.problems import (
     STEP_NS,
     Solved,

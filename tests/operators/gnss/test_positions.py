@@ -12,9 +12,10 @@ from mapstream.operators.gnss.positions import Gnss, GnssConfig
 from mapstream.operators.operator import Context
 from mapstream.operators.testing import run_operator
 from mapstream.operators.trajectory.config import TrajectoryConfig
+from mapstream.streams.arrays import FloatArray
 from mapstream.streams.geometry import SE3
 from mapstream.streams.messages.constraints import Constraint
-from mapstream.streams.messages.sensors import FloatArray, GnssFix
+from mapstream.streams.messages.sensors import GnssFix
 from tests.operators.estimation.problems import (
     STEP_NS,
     Solved,

@@ -9,10 +9,11 @@ from mapstream.operators.estimation.factors.inertial import Bias
 from mapstream.operators.imu.biases import ImuBiases, ImuBiasesConfig
 from mapstream.operators.operator import Context
 from mapstream.operators.testing import run_operator
+from mapstream.streams.arrays import FloatArray, IntArray
 from mapstream.streams.errors import EstimationError
 from mapstream.streams.geometry import SE3, se3_exp, so3_exp
 from mapstream.streams.messages.estimates import Odometry
-from mapstream.streams.messages.sensors import FloatArray, ImuBatch, IntArray
+from mapstream.streams.messages.sensors import ImuBatch
 from tests.operators.estimation.test_inertial import Flight
 
 pytestmark = pytest.mark.anyio

@@ -17,8 +17,9 @@ from mapstream.operators.sources.mcap_config import McapSourceConfig
 from mapstream.operators.testing import run_operator
 from mapstream.recordings.worlds.box_room import box_room
 from mapstream.recordings.worlds.catalogue import simulate
+from mapstream.streams.arrays import FloatArray
 from mapstream.streams.geometry import SE3
-from mapstream.streams.messages.sensors import FloatArray, LidarScan
+from mapstream.streams.messages.sensors import LidarScan
 from mapstream.streams.trajectory import Trajectory
 
 

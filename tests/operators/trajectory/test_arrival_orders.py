@@ -11,10 +11,10 @@ from mapstream.operators.trajectory.motion_models import StandingStill
 from mapstream.recordings.maps.check import check_map
 from mapstream.recordings.maps.model import Map
 from mapstream.recordings.maps.rows import table_digest
+from mapstream.streams.arrays import FloatArray
 from mapstream.streams.geometry import invert
 from mapstream.streams.messages.constraints import Constraint
 from mapstream.streams.messages.estimates import Submap
-from mapstream.streams.messages.sensors import FloatArray
 from tests.operators.trajectory.drives import MS, Message, Robot, fix, imu, odometry, wheels
 
 WHEEL_STAMPS = range(0, 1000 * MS, 100 * MS)

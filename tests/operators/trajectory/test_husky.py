@@ -18,8 +18,8 @@ from mapstream.operators.trajectory.config import TrajectoryConfig
 from mapstream.operators.trajectory.trajectory import Trajectory
 from mapstream.recordings.maps.check import check_map
 from mapstream.recordings.maps.model import Map
+from mapstream.streams.arrays import FloatArray
 from mapstream.streams.messages.constraints import Constraint
-from mapstream.streams.messages.sensors import FloatArray
 from tests.data import shared
 
 pytestmark = [pytest.mark.anyio, pytest.mark.slow]

@@ -18,9 +18,9 @@ from mapstream.operators.trajectory.config import TrajectoryConfig
 from mapstream.operators.trajectory.trajectory import Trajectory
 from mapstream.recordings.datasets.catalogue import convert
 from mapstream.recordings.maps.model import Map
+from mapstream.streams.arrays import FloatArray
 from mapstream.streams.geometry import SE3
 from mapstream.streams.messages.constraints import Constraint
-from mapstream.streams.messages.sensors import FloatArray
 
 pytestmark = [pytest.mark.anyio, pytest.mark.slow]
 

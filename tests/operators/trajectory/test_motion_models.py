@@ -18,10 +18,10 @@ from mapstream.recordings.maps.submaps import append_submap
 from mapstream.recordings.worlds.motion import Motion
 from mapstream.recordings.worlds.ring import Ring
 from mapstream.recordings.worlds.w_lid import WLidConfig, drive
+from mapstream.streams.arrays import FloatArray
 from mapstream.streams.geometry import SE3, invert, se3_exp
 from mapstream.streams.messages.constraints import Constraint, OuterFrame
 from mapstream.streams.messages.estimates import Odometry
-from mapstream.streams.messages.sensors import FloatArray
 
 pytestmark = pytest.mark.anyio
 

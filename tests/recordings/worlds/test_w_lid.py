@@ -21,9 +21,10 @@ from mapstream.recordings.worlds.sensors import (
     imu_batches,
 )
 from mapstream.recordings.worlds.w_lid import START_NS, T_BASE_IMU, WLidConfig, drive, w_lid
+from mapstream.streams.arrays import FloatArray
 from mapstream.streams.errors import ConfigError
 from mapstream.streams.geometry import SE3, invert, so3_exp
-from mapstream.streams.messages.sensors import FloatArray, LidarScan
+from mapstream.streams.messages.sensors import LidarScan
 from mapstream.streams.trajectory import Trajectory
 
 SMALL: dict[str, Any] = {"length_m": 36.0, "speed_mps": 8.0, "lidar": {"beams": 4, "columns": 32}}

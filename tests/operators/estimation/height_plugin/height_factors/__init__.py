@@ -10,7 +10,7 @@ import numpy as np
 
 from mapstream.operators.estimation.noise import Factor, NoiseModels
 from mapstream.recordings.maps.model import Map
-from mapstream.streams.messages.sensors import FloatArray, IntArray
+from mapstream.streams.arrays import FloatArray, IntArray
 
 
 def height_differences(map_: Map, rows: IntArray, noise_of: NoiseModels) -> dict[int, Factor]:
