@@ -6,7 +6,7 @@ Calibration from Planar Grids, ICRA 2007). Distortions are named as in maplab an
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal, get_args
 
 import numpy as np
@@ -58,6 +58,22 @@ class CameraCalibration:
         if count not in expected:
             wanted = " or ".join(map(str, expected))
             raise ValueError(f"{name}: {self.distortion} has {wanted} parameters, not {count}")
+
+    def resized(self, width_px: int, height_px: int) -> CameraCalibration:
+        """Return the calibration of the same images in another size; edges of pixels stay edges.
+
+        Raises:
+            ValueError: If a size is not positive.
+        """
+        scale = np.array([width_px / self.width_px, height_px / self.height_px])
+        return replace(
+            self,
+            width_px=width_px,
+            height_px=height_px,
+            focal_px=self.focal_px * scale,
+            center_px=(self.center_px + 0.5) * scale - 0.5,
+            line_delay_ns=round(self.line_delay_ns / scale[1]) if self.line_delay_ns else 0,
+        )
 
     @property
     def camera_matrix(self) -> FloatArray:

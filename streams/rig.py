@@ -9,7 +9,13 @@ from dataclasses import dataclass
 from mapstream.streams.errors import ConfigError
 from mapstream.streams.geometry import SE3
 from mapstream.streams.messages.sensors import TransformBatch
-from mapstream.streams.sensors import CameraRigSensor, FeatureSensor, Sensor, SensorKind
+from mapstream.streams.sensors import (
+    CameraRigSensor,
+    CameraSensor,
+    FeatureSensor,
+    Sensor,
+    SensorKind,
+)
 from mapstream.streams.transforms import TransformTree
 
 _log = logging.getLogger(__name__)
@@ -118,6 +124,21 @@ class Rig:
     def sensor_of_topic(self, topic: str) -> Sensor | None:
         """Return the sensor that speaks on a topic, or None if the rig does not say."""
         return next((s for s in self._by_id.values() if s.topic and s.topic == topic), None)
+
+    def camera_of_frame(self, frame: str) -> CameraSensor | None:
+        """Return the camera with a name on `/tf`, or None if the rig does not say."""
+        cameras = (s for s in self._by_id.values() if isinstance(s, CameraSensor))
+        return next((camera for camera in cameras if camera.node == frame), None)
+
+    def frame_of(self, sensor: Sensor) -> str:
+        """Return the frame that a sensor's messages are in: features are in that of their camera.
+
+        Raises:
+            ConfigError: If the sensor is of another rig.
+        """
+        if isinstance(sensor, FeatureSensor):
+            return self.sensor(sensor.target_sensor_id).node
+        return sensor.node
 
     def add_transforms(self, batch: TransformBatch) -> None:
         """Take what `/tf` says of frames whose place the rig's file does not fix.

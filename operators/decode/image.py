@@ -9,7 +9,8 @@ import cv2
 import numpy as np
 from pydantic import Field
 
-from mapstream.operators.operator import Operator, OperatorConfig, pipeline, report_loss
+from mapstream.operators.images.calibrated import WrongSize, fitted, is_black
+from mapstream.operators.operator import Operator, OperatorConfig, pipeline, report_loss, warn
 from mapstream.streams.channel import Receiver, Sender
 from mapstream.streams.messages.sensors import CameraFrame, EncodedImage
 
@@ -24,6 +25,11 @@ class ImageDecodeConfig(OperatorConfig):
     mode: Literal["color", "gray", "as_recorded"] = Field(
         default="as_recorded",
         description="color is bgr8, gray is mono8; 16 bits stay only as recorded",
+    )
+    on_wrong_size: WrongSize = Field(
+        default="drop",
+        description="what to do with images that are not of their calibration's size: drop them, or"
+        " rescale the calibration",
     )
 
 
@@ -47,13 +53,16 @@ class ImageDecode(Operator[Inputs, Outputs]):
 
     def __init__(self, config: ImageDecodeConfig) -> None:
         self._flag = _FLAGS[config.mode]
+        self._on_wrong_size = config.on_wrong_size
 
     async def run(self, inputs: Inputs, outputs: Outputs) -> None:
         async def send(result: CameraFrame | _Refused) -> None:
             if isinstance(result, CameraFrame):
+                if is_black(result):
+                    warn(f"images of {result.frame} that are black")
                 await outputs.frames.send(result)
             else:
-                report_loss(f"images of {result.frame} that cannot be decoded ({result.format})")
+                report_loss(result.reason)
                 outputs.frames.advance(result.stamp_ns)
 
         await pipeline(self.decode, inputs.images, send)
@@ -65,20 +74,23 @@ class ImageDecode(Operator[Inputs, Outputs]):
         except cv2.error:
             pixels = None
         if pixels is None:
-            return _Refused(image.stamp_ns, image.frame, image.format)
+            return _undecodable(image, image.format)
         if pixels.ndim == 3 and pixels.shape[2] == 4:
             pixels = np.ascontiguousarray(pixels[:, :, :3])  # without alpha
         encoding = "bgr8" if pixels.ndim == 3 else _GRAY.get(pixels.dtype.name)
         if encoding is None or (pixels.ndim == 3 and pixels.dtype != np.uint8):
-            return _Refused(image.stamp_ns, image.frame, f"{image.format} of {pixels.dtype}")
-        return CameraFrame(
+            return _undecodable(image, f"{image.format} of {pixels.dtype}")
+        frame = CameraFrame(
             stamp_ns=image.stamp_ns,
             image=pixels,
             encoding=encoding,
             frame=image.frame,
             T_base_sensor=image.T_base_sensor,
+            camera=image.camera,
             record=image.record,
         )
+        result = fitted(frame, self._on_wrong_size)
+        return _Refused(image.stamp_ns, result) if isinstance(result, str) else result
 
 
 _GRAY = {"uint8": "mono8", "uint16": "mono16", "float32": "32FC1"}
@@ -87,5 +99,8 @@ _GRAY = {"uint8": "mono8", "uint16": "mono16", "float32": "32FC1"}
 @dataclass(frozen=True, slots=True)
 class _Refused:
     stamp_ns: int
-    frame: str
-    format: str
+    reason: str
+
+
+def _undecodable(image: EncodedImage, what: str) -> _Refused:
+    return _Refused(image.stamp_ns, f"images of {image.frame} that cannot be decoded ({what})")

@@ -15,12 +15,14 @@ from mapstream.operators.operator import (
     context,
     offload,
 )
+from mapstream.operators.sources.cameras import Cameras
+from mapstream.operators.sources.completion import Reading
 from mapstream.operators.sources.extrinsics import Extrinsics
 from mapstream.operators.sources.mcap_config import McapSourceConfig
 from mapstream.operators.sources.playback import Playback
 from mapstream.operators.sources.seeking import Seekable
 from mapstream.operators.sources.stamps import StampWatch
-from mapstream.operators.sources.topic_reader import Played, Reading, TopicReader
+from mapstream.operators.sources.topic_reader import Played, TopicReader
 from mapstream.recordings.attached_rig import attached_rig
 from mapstream.recordings.decoding import Decoder, decoder_for
 from mapstream.recordings.recording import Recording, check_topics, open_recording
@@ -45,6 +47,7 @@ class McapSource(DynamicPorts, Operator[NoPorts, Ports]):
         self.config = config
         self._readers: dict[str, TopicReader] = {}
         self._extrinsics: Extrinsics | None = None
+        self._cameras: Cameras | None = None
         self._num_losses = 0
         self._advanced_ns: int | None = None
 
@@ -79,17 +82,21 @@ class McapSource(DynamicPorts, Operator[NoPorts, Ports]):
         """
         config = self.config
         wanted = {port: config.topic(port) for port in config.topics}
-        check_topics(config.path, [topic.topic for topic in wanted.values()], recording.topics)
+        given = [topic.calibration for topic in wanted.values() if topic.calibration]
+        topics = [topic.topic for topic in wanted.values()]
+        check_topics(config.path, topics + given, recording.topics)
         rig = load_rig(config.rig) if config.rig else attached_rig(recording)
         rig = rig or Rig(base_frame="base_link")
         base_frame = config.base_frame or rig.base_frame
         self._extrinsics = Extrinsics(recording, config.transforms, rig.transforms, base_frame)
+        self._cameras = Cameras(recording, rig)
         return {
             port: TopicReader(
                 self._reading(port, recording, rig),
                 self._decoder(port, recording),
                 StampWatch(topic.topic, max_jump_ns=round(config.max_jump_s * 1e9)),
                 self._extrinsics,
+                self._cameras,
             )
             for port, topic in wanted.items()
         }
@@ -111,7 +118,9 @@ class McapSource(DynamicPorts, Operator[NoPorts, Ports]):
             path=str(config.path),
             offset_ns=round(topic.offset_s * 1e9) + (sensor.time_offset_ns if sensor else 0),
             stamp=topic.stamp,
-            frame=topic.frame or (sensor.node if sensor else ""),
+            frame=topic.frame or (rig.frame_of(sensor) if sensor else ""),
+            calibration=topic.calibration,
+            on_wrong_size=config.on_wrong_size,
             batch_ns=round(config.imu_batch_s * 1e9),
             origin_ns=recording.start_ns,
             stops_on_error=config.on_error == "stop",
@@ -172,8 +181,8 @@ class McapSource(DynamicPorts, Operator[NoPorts, Ports]):
                 count = loss.num_messages or "an unknown number of"
                 activity.losses[f"{text}; {count} messages lost"] = 1
         self._num_losses = len(recording.losses)
-        if self._extrinsics is not None:
-            activity.warnings.update(self._extrinsics.notices)
+        for found in (self._extrinsics, self._cameras):
+            activity.warnings.update(found.notices if found else {})
         for reader in self._readers.values():
             activity.warnings.update({f"{path}: {t}": n for t, n in reader.notices.items()})
             of_topic = f"{path}: {reader.topic}"

@@ -7,6 +7,7 @@ from typing import Any, Literal
 
 from pydantic import Field, NonNegativeFloat, PositiveFloat, field_validator
 
+from mapstream.operators.images.calibrated import WrongSize
 from mapstream.operators.operator import OperatorConfig, OptionalPath
 from mapstream.recordings.message_codec import known_messages
 from mapstream.streams.calibration import CameraCalibration
@@ -64,13 +65,19 @@ class TopicConfig(OperatorConfig):
         default=None, description="the sensor's frame, if not the recorded one"
     )
 
+    calibration: str | None = Field(
+        default=None,
+        description="of a camera's images: the topic that describes the camera, where it is not found"
+        " in the sensor file or beside the images",
+    )
+
     _check_type = field_validator("type")(check_message_name)
 
 
 class McapSourceConfig(OperatorConfig):
     path: Path = Field(description="an .mcap, .bag or .db3 file, or a rosbag2 folder")
     topics: dict[str, str | TopicConfig] = Field(
-        description="port: topic, or port: {topic, type, offset_s, stamp, frame}"
+        description="port: topic, or port: {topic, type, offset_s, stamp, frame, calibration}"
     )
     rig: OptionalPath = Field(
         default=None,
@@ -93,6 +100,11 @@ class McapSourceConfig(OperatorConfig):
     )
     max_jump_s: PositiveFloat = Field(
         default=5.0, description="a clock that jumps farther starts a new epoch"
+    )
+    on_wrong_size: WrongSize = Field(
+        default="drop",
+        description="what to do with images that are not of their calibration's size: drop them, or"
+        " rescale the calibration",
     )
     on_error: Literal["skip", "stop"] = Field(
         default="skip", description="what to do with messages that cannot be decoded"

@@ -4,24 +4,21 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields, replace
-from functools import cache
+from dataclasses import dataclass, field, replace
 from itertools import groupby
-from typing import Any, Literal
 
 import numpy as np
 
+from mapstream.operators.sources.cameras import Cameras
+from mapstream.operators.sources.completion import Completion, Reading
 from mapstream.operators.sources.extrinsics import Extrinsics
 from mapstream.operators.sources.stamps import StampWatch
 from mapstream.recordings.decoding import Decoder
 from mapstream.recordings.recording import RawMessage
-from mapstream.streams.errors import DecodeError, TransformError
+from mapstream.streams.errors import DecodeError
 from mapstream.streams.messages.sensors import (
     ImuBatch,
-    LidarScan,
     Message,
-    RecordRef,
-    TransformBatch,
 )
 
 
@@ -36,31 +33,22 @@ class Played:
     lags: Mapping[str, int] = field(default_factory=dict)  # of the ports in this epoch, read ahead
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Reading:
-    """How a topic becomes a port."""
-
-    port: str
-    path: str
-    offset_ns: int = 0  # added to all stamps
-    stamp: Literal["header", "log"] = "header"
-    frame: str = ""  # of the sensor, where it is not the recorded one
-    batch_ns: int = 0  # IMU samples of this much log time make one message
-    origin_ns: int = 0  # where batches begin
-    stops_on_error: bool = False
-
-
 class TopicReader:
     """Decodes one topic, corrects its stamps, gathers IMU samples into batches."""
 
     def __init__(
-        self, reading: Reading, decoder: Decoder, watch: StampWatch, extrinsics: Extrinsics
+        self,
+        reading: Reading,
+        decoder: Decoder,
+        watch: StampWatch,
+        extrinsics: Extrinsics,
+        cameras: Cameras,
     ) -> None:
         self.reading = reading
         self.watch = watch
-        self.losses: Counter[str] = Counter()
         self._decoder = decoder
-        self._extrinsics = extrinsics
+        self._complete = Completion(reading, watch, extrinsics, cameras)
+        self._undecoded: Counter[str] = Counter()
         self._samples: list[RawMessage] = []  # of the batch that is growing
         self._batch_end_ns = 0
         self._first_error = ""
@@ -74,6 +62,11 @@ class TopicReader:
         """What was odd so far, by name."""
         of_decoder = {f"{self.topic}: {text}": n for text, n in self._decoder.notices.items()}
         return self.watch.notices + Counter(of_decoder)
+
+    @property
+    def losses(self) -> Counter[str]:
+        """What of the topic is gone, by name."""
+        return self._undecoded + self._complete.losses
 
     def read(self, raw: RawMessage) -> list[Played]:
         """Take the next message of the topic, after `flush`; return it if it needs no others.
@@ -116,7 +109,7 @@ class TopicReader:
                     raise
                 first = str(error).removeprefix(f"{self.topic}: ")
                 self._first_error = self._first_error or first
-                self.losses[
+                self._undecoded[
                     f"messages that cannot be decoded; the first is {self._first_error}"
                 ] += 1
         return found
@@ -158,55 +151,12 @@ class TopicReader:
         )
 
     def _played(self, message: Message, raw: RawMessage) -> list[Played]:
-        """Complete a message; none is left of one whose sensor's place is not known at its time."""
-        reading, names = self.reading, _names(type(message))
-        shift_ns = self._shift_ns(message, raw)
-        changes: dict[str, Any] = {}
-        if shift_ns and isinstance(message, (ImuBatch, TransformBatch)):
-            changes["stamps_ns"] = message.stamps_ns + shift_ns
-        elif shift_ns and "stamp_ns" in names:
-            changes["stamp_ns"] = message.stamp_ns + shift_ns
-        if "record" in names:
-            changes["record"] = RecordRef(path=reading.path, topic=raw.topic, log_ns=raw.log_ns)
-        if reading.frame and "frame" in names:
-            changes["frame"] = reading.frame
-        if "T_base_sensor" in names:
-            frame = reading.frame or getattr(message, "frame", "")
-            try:
-                place = self._extrinsics.place(frame, message.stamp_ns + shift_ns)
-            except TransformError as error:
-                self.losses[f"messages without a place: {str(error).rsplit(':', 1)[0]}"] += 1
-                return []
-            if place is not None:
-                changes["T_base_sensor"] = place
-        if changes:
-            message = replace(message, **changes)  # type: ignore[type-var]  # a dataclass by its names
-        if isinstance(message, LidarScan) and _is_of_one_time(message):
-            self.watch.note("scans whose points all have one time, not deskewed", raw.log_ns)
-        jumped = self.watch.see(message.stamp_ns, raw.log_ns)
-        return [Played(reading.port, message, raw.log_ns, jumped)]
-
-    def _shift_ns(self, message: Message, raw: RawMessage) -> int:
-        """Return what has to be added to the stamps."""
-        reading = self.reading
-        if message.stamp_ns > 0 and reading.stamp == "header":
-            return reading.offset_ns
-        if reading.stamp == "header":
-            self.watch.note("stamps of zero, the log time is used", raw.log_ns)
-        return reading.offset_ns + raw.log_ns - message.stamp_ns
-
-
-def _is_of_one_time(scan: LidarScan) -> bool:
-    """Return whether points carry times that say nothing."""
-    offsets_ns = scan.offsets_ns
-    return (
-        offsets_ns is not None and len(offsets_ns) > 1 and bool((offsets_ns == offsets_ns[0]).all())
-    )
-
-
-@cache
-def _names(cls: type) -> frozenset[str]:
-    return frozenset(field.name for field in fields(cls))
+        """Complete a message; none is left of one that has to go."""
+        whole = self._complete(message, raw)
+        if whole is None:
+            return []
+        jumped = self.watch.see(whole.stamp_ns, raw.log_ns)
+        return [Played(self.reading.port, whole, raw.log_ns, jumped)]
 
 
 def _joined(batches: list[ImuBatch]) -> ImuBatch:
