@@ -36,8 +36,8 @@ from mapstream.operators.estimation.sparse_solver import sparse_levenberg_marqua
 from mapstream.operators.estimation.starts.landmark_starts import averaged_landmarks
 from mapstream.operators.estimation.starts.start import chordal_values
 from mapstream.operators.estimation.states import Values, with_solution
+from mapstream.recordings.maps.columns import BoolArray
 from mapstream.recordings.maps.model import Map
-from mapstream.recordings.maps.tables import BoolArray
 from mapstream.streams.errors import EstimationError
 
 __all__ = ["OptimizationReport", "OptimizeConfig", "optimize_map"]

@@ -8,8 +8,8 @@ import numpy as np
 from mapstream.operators.estimation.fixing import fixed
 from mapstream.operators.estimation.keys import variable_of
 from mapstream.operators.estimation.noise import Factor
+from mapstream.recordings.maps.columns import BoolArray
 from mapstream.recordings.maps.model import Map
-from mapstream.recordings.maps.tables import BoolArray
 from mapstream.streams.arrays import FloatArray, IntArray
 
 _LEVEL_KINDS = ("imu", "gravity")  # they know where up is

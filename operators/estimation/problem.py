@@ -21,8 +21,8 @@ from mapstream.operators.estimation.outliers.consistency import chi2_gate
 from mapstream.operators.estimation.priors import prior_factors
 from mapstream.operators.estimation.solvers import Graph
 from mapstream.operators.estimation.states import Values, initial_values
+from mapstream.recordings.maps.columns import BoolArray
 from mapstream.recordings.maps.model import Map
-from mapstream.recordings.maps.tables import BoolArray
 from mapstream.streams.arrays import FloatArray, IntArray
 
 _RELATIVE = ("odometry", "wheel", "registration", "motion_model", "loop")  # need no priors

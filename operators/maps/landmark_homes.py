@@ -6,8 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 
+from mapstream.recordings.maps.columns import BoolArray
 from mapstream.recordings.maps.model import Map
-from mapstream.recordings.maps.tables import BoolArray, Landmarks
+from mapstream.recordings.maps.tables import Landmarks
 from mapstream.streams.arrays import IntArray
 from mapstream.streams.geometry import (
     invert,

@@ -11,18 +11,23 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from mapstream.operators.operator import OperatorConfig
+from mapstream.recordings.maps.columns import BoolArray, IdArray, references_of
 from mapstream.recordings.maps.combine import select_missions
 from mapstream.recordings.maps.ids import as_keys
 from mapstream.recordings.maps.model import TABLES, Map, from_tables
 from mapstream.recordings.maps.order import in_canonical_order
 from mapstream.recordings.maps.rows import concatenate, shifted, table_digest
-from mapstream.recordings.maps.tables import BoolArray, Frames, IdArray, Journal, references_of
+from mapstream.recordings.maps.tables import Frames, Journal
 from mapstream.streams.arrays import IntArray
 from mapstream.streams.errors import MapError
 from mapstream.streams.geometry import invert
 
 _WITH_IDS = ("missions", "frames", "vertices", "landmarks", "edges", "resources")
-_PARTS = (("imu", "edge"), ("observations", "vertex"))  # go with what they are a part of
+_PARTS = (
+    ("imu", "edge"),
+    ("feature_sets", "vertex"),
+    ("observations", "vertex"),
+)  # go with what they are a part of
 
 
 class MergeConfig(OperatorConfig):
@@ -151,7 +156,7 @@ def _with_each_row_once(map_: Map) -> Map:
         redirected = {
             column.name: stands_for[str(column.refers_to)][getattr(table, column.name)]
             for column in references_of(type(table))
-            if (name, column.name) not in _PARTS
+            if column.refers_to in _WITH_IDS and (name, column.name) not in _PARTS
         }
         tables[name] = replace(table, **redirected) if redirected else table
     return from_tables(tables).select(**keep)

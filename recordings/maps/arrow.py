@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
 
-from mapstream.recordings.maps.tables import Column, Table, TableT, columns_of
+from mapstream.recordings.maps.columns import Column, Table, TableT, columns_of
 
 
 def arrow_schema(table_type: type[Table]) -> Any:  # noqa: ANN401  # pyarrow has no types

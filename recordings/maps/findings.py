@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from mapstream.recordings.maps.columns import BoolArray
 from mapstream.recordings.maps.model import Map
-from mapstream.recordings.maps.tables import BoolArray
 from mapstream.streams.arrays import IntArray
 
 Sentence = str | Callable[[int], str]  # one for all rows, or made for a row

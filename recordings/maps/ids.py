@@ -8,7 +8,7 @@ from hashlib import blake2b
 import numpy as np
 import numpy.typing as npt
 
-from mapstream.recordings.maps.tables import IdArray
+from mapstream.recordings.maps.columns import IdArray
 
 NUM_BYTES = 16
 

@@ -16,10 +16,10 @@ from mapstream.recordings.maps.model import TABLES
 from mapstream.streams.errors import MapFormatError
 
 IDENTIFIER = "mapstream map"
-VERSION = 2
+VERSION = 3
 MANIFEST = "manifest.json"
 TABLES_FOLDER = "tables"
-_FILE = re.compile(r"tables/[a-z]+-[0-9a-f]{16}\.arrow")
+_FILE = re.compile(r"tables/[a-z_]+-[0-9a-f]{16}\.arrow")
 _MAX_MANIFEST_BYTES = 1_000_000
 
 

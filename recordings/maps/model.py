@@ -14,11 +14,12 @@ from typing import Any, cast
 import numpy as np
 import numpy.typing as npt
 
+from mapstream.recordings.maps.columns import BoolArray, Table
 from mapstream.recordings.maps.ids import as_keys, id_array, id_bytes, vertex_id
 from mapstream.recordings.maps.rows import select, table_digest
 from mapstream.recordings.maps.tables import (
-    BoolArray,
     Edges,
+    FeatureSets,
     Frames,
     ImuSamples,
     Journal,
@@ -26,7 +27,6 @@ from mapstream.recordings.maps.tables import (
     Missions,
     Observations,
     Resources,
-    Table,
     Vertices,
 )
 from mapstream.streams.arrays import FloatArray, IntArray
@@ -45,6 +45,7 @@ class Map:
     landmarks: Landmarks = field(default_factory=Landmarks)
     edges: Edges = field(default_factory=Edges)
     imu: ImuSamples = field(default_factory=ImuSamples)
+    feature_sets: FeatureSets = field(default_factory=FeatureSets)
     observations: Observations = field(default_factory=Observations)
     resources: Resources = field(default_factory=Resources)
     journal: Journal = field(default_factory=Journal)

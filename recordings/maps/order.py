@@ -9,10 +9,11 @@ import numpy as np
 import numpy.typing as npt
 
 from mapstream.recordings.maps.build import append_edges
+from mapstream.recordings.maps.columns import references_of
 from mapstream.recordings.maps.ids import as_keys
 from mapstream.recordings.maps.model import Map, from_tables
 from mapstream.recordings.maps.rows import take
-from mapstream.recordings.maps.tables import Edges, references_of
+from mapstream.recordings.maps.tables import Edges
 from mapstream.streams.arrays import IntArray
 
 
@@ -28,7 +29,12 @@ def in_canonical_order(map_: Map) -> Map:
     map_ = _with_rows(map_, "edges", _by_content(map_.edges))
     map_ = append_edges(replace(map_, edges=Edges()), map_.edges)  # ids of alike edges count anew
     map_ = _with_rows(map_, "imu", np.lexsort((map_.imu.stamp_ns, map_.imu.edge)))
-    map_ = _with_rows(map_, "observations", np.argsort(map_.observations.vertex, kind="stable"))
+    sets = map_.feature_sets
+    by_image = np.lexsort((sets.kind.astype(str), sets.sensor.astype(str), sets.vertex))
+    map_ = _with_rows(map_, "feature_sets", by_image)
+    seen = map_.observations
+    by_feature = np.lexsort((seen.feature, seen.feature_set, seen.vertex))
+    map_ = _with_rows(map_, "observations", by_feature)
     return _with_rows(map_, "resources", np.argsort(map_.resources.vertex, kind="stable"))
 
 

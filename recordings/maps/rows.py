@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from mapstream.recordings.maps.tables import (
+from mapstream.recordings.maps.columns import (
     BoolArray,
     Column,
     Table,

@@ -12,6 +12,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from mapstream.recordings.maps.arrow import mapped, read_table, write_table
+from mapstream.recordings.maps.columns import Table
 from mapstream.recordings.maps.folder import TEMPORARY, FolderLock, write_whole
 from mapstream.recordings.maps.manifest import (
     MANIFEST,
@@ -25,7 +26,6 @@ from mapstream.recordings.maps.manifest import (
     write_manifest,
 )
 from mapstream.recordings.maps.model import TABLES, Map, from_tables
-from mapstream.recordings.maps.tables import Table
 from mapstream.streams.errors import MapError, MapFormatError
 
 __all__ = [

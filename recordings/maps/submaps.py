@@ -9,6 +9,7 @@ import numpy as np
 
 from mapstream.recordings.maps.build import add_edges, add_records, new_mission
 from mapstream.recordings.maps.constraints import add_constraints
+from mapstream.recordings.maps.features import add_features
 from mapstream.recordings.maps.ids import id_array, vertex_id
 from mapstream.recordings.maps.model import Map
 from mapstream.recordings.maps.rows import concatenate
@@ -90,10 +91,10 @@ def _with_vertices(
     )
     first_new = len(map_.vertices)
     map_ = replace(map_, vertices=concatenate([map_.vertices, vertices]))
-    records = [
-        (first_new + at, r) for at, keyframe in enumerate(keyframes) for r in keyframe.records
-    ]
-    return add_records(map_, records)
+    rows = [(first_new + at, keyframe) for at, keyframe in enumerate(keyframes)]
+    map_ = add_records(map_, [(row, r) for row, keyframe in rows for r in keyframe.records])
+    seen = [(row, keyframe.stamp_ns, f) for row, keyframe in rows for f in keyframe.features]
+    return add_features(map_, mission_row, seen)
 
 
 def _stacked_poses(keyframes: Sequence[Keyframe]) -> FloatArray:

@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from mapstream.recordings.maps.columns import BoolArray, TextArray, columns_of
 from mapstream.recordings.maps.findings import Finding, Rule, where
 from mapstream.recordings.maps.model import Map
-from mapstream.recordings.maps.tables import BoolArray, TextArray, columns_of
 from mapstream.streams.arrays import FloatArray
 
 _ROTATION_TOLERANCE = 1e-6  # poses that were composed thousands of times stay below it
@@ -24,6 +24,7 @@ _OPTIONAL_STATES = (
     ("frames", "origin_lla"),
     ("landmarks", "quat_base_xyzw"),
 )
+_DESCRIPTOR_BYTES = {"uint8": 1, "float32": 4}
 _QUALITIES = ["unknown", "bad", "good"]
 
 
@@ -181,6 +182,29 @@ def observations_have_an_uncertainty(map_: Map) -> Iterable[Finding]:
     yield from where(broken, "observations", lambda row: f"sigma is {sigma[row]}, not positive")
 
 
+def feature_sets_are_whole(map_: Map) -> Iterable[Finding]:
+    """A set holds descriptors of its width, and those that observations refer to are in it."""
+    sets, seen = map_.feature_sets, map_.observations
+    item_bytes = np.array([_DESCRIPTOR_BYTES.get(dtype, 0) for dtype in sets.dtype], dtype=np.int64)
+    unknown = item_bytes == 0
+    yield from where(
+        unknown, "feature_sets", lambda row: f"descriptors of type {sets.dtype[row]!r}"
+    )
+    num_bytes = np.fromiter(map(len, sets.descriptors), dtype=np.int64, count=len(sets))
+    row_bytes = item_bytes * sets.width
+    broken = ~unknown & ((sets.width < 0) | (num_bytes % np.maximum(row_bytes, 1) != 0))
+    broken |= (row_bytes == 0) & (num_bytes > 0)
+    yield from where(broken, "feature_sets", "the descriptors are not a whole number of rows")
+    has_set = seen.feature_set >= 0
+    num_rows = np.append(num_bytes // np.maximum(row_bytes, 1), 0)[seen.feature_set]
+    misses = has_set & ((seen.feature < 0) | (seen.feature >= num_rows))
+    yield from where(misses, "observations", "its descriptor is not in its feature set")
+    kinds = np.append(sets.kind, "")[seen.feature_set]
+    yield from where(
+        has_set & (kinds != seen.kind), "observations", "its feature set is of another kind"
+    )
+
+
 def texts_are_json(map_: Map) -> Iterable[Finding]:
     """Sensor sets and parameters of the journal are JSON objects."""
     for table, texts in (
@@ -227,6 +251,7 @@ VALUE_RULES: tuple[Rule, ...] = (
     qualities_are_known,
     observations_say_something,
     observations_have_an_uncertainty,
+    feature_sets_are_whole,
     texts_are_json,
     resources_stay_in_the_folder,
 )

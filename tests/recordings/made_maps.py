@@ -12,7 +12,14 @@ from mapstream.recordings.maps.build import append_edges
 from mapstream.recordings.maps.ids import derived_id, id_array
 from mapstream.recordings.maps.model import Map
 from mapstream.recordings.maps.submaps import append_submap
-from mapstream.recordings.maps.tables import Edges, Frames, ImuSamples, Landmarks, Observations
+from mapstream.recordings.maps.tables import (
+    Edges,
+    FeatureSets,
+    Frames,
+    ImuSamples,
+    Landmarks,
+    Observations,
+)
 from mapstream.streams.geometry import SE3
 from mapstream.streams.messages.estimates import (
     Keyframe,
@@ -100,18 +107,37 @@ def full_map() -> Map:
         covariance=np.tile(np.eye(3) * 0.01, (4, 1, 1)),
         payload=np.array([b"", b"", b"", b"\x00\xffhull"], dtype=object),
     )
+    feature_sets = FeatureSets(
+        vertex=np.array([0, 1]),
+        sensor=np.array(["camera", "camera"], dtype=object),
+        kind=np.array(["orb", "sift"], dtype=object),
+        dtype=np.array(["uint8", "float32"], dtype=object),
+        width=np.array([2, 1]),
+        descriptors=np.array([b"\x01\x02", np.float32([1, 2]).tobytes()], dtype=object),
+    )
     observations = Observations(
         vertex=np.array([0, 1, 2, 3, 3]),
         landmark=np.array([0, 0, 2, 3, -1]),
         sensor=np.array(["camera", "camera", "lidar", "camera", "camera"], dtype=object),
         keypoint_px=np.ones((5, 2), dtype=np.float32),
+        kind=np.array(["orb", "sift", "", "", ""], dtype=object),
+        track=np.array([7, -1, -1, -1, -1]),
+        feature_set=np.array([0, 1, -1, -1, -1]),
+        feature=np.array([0, 1, -1, -1, -1]),
     )
     frames = Frames(
         id=id_array([derived_id("frame", "enu")]),
         name=np.array(["enu"], dtype=object),
         origin_lla=np.array([[47.3, 8.5, 410.0]]),
     )
-    map_ = replace(map_, frames=frames, imu=samples, landmarks=landmarks, observations=observations)
+    map_ = replace(
+        map_,
+        frames=frames,
+        imu=samples,
+        landmarks=landmarks,
+        feature_sets=feature_sets,
+        observations=observations,
+    )
     fix = Edges(
         kind=np.array(["absolute"], dtype=object), vertex_a=np.array([2]), frame=np.array([0])
     )

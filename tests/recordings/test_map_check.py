@@ -115,6 +115,11 @@ CORRUPTIONS: list[tuple[str, str, int, Callable[[Map], Map]]] = [
     ("qualities_are_known", "landmarks", 1, changed("landmarks", "quality", 1, "fair")),
     ("observations_say_something", "observations", 1, changed("observations", "keypoint_px", 1, np.nan)),
     ("observations_have_an_uncertainty", "observations", 1, changed("observations", "sigma", 1, 0)),
+    ("feature_sets_are_whole", "feature_sets", 1, changed("feature_sets", "dtype", 1, "object")),
+    ("feature_sets_are_whole", "feature_sets", 1, changed("feature_sets", "width", 1, 3)),
+    ("feature_sets_are_whole", "observations", 1, changed("observations", "feature", 1, 2)),
+    ("feature_sets_are_whole", "observations", 1, changed("observations", "kind", 1, "orb")),
+    ("references_lead_somewhere", "observations", 1, changed("observations", "feature_set", 1, 2)),
     ("texts_are_json", "missions", 0, changed("missions", "sensors", 0, "{lidar")),
     ("resources_stay_in_the_folder", "resources", 1, changed("resources", "topic", 1, "")),
 ]  # fmt: skip

@@ -8,9 +8,9 @@ from pathlib import Path
 import pytest
 
 from mapstream.recordings.maps import load_map, save_map
+from mapstream.recordings.maps.columns import columns_of
 from mapstream.recordings.maps.model import TABLES
 from mapstream.recordings.maps.store import VERSION
-from mapstream.recordings.maps.tables import columns_of
 from tests.recordings.made_maps import line_map
 
 PAGE = (Path(__file__).parents[2] / "docs" / "map-format.md").read_text()

@@ -16,6 +16,7 @@ from mapstream.recordings.maps import Map, load_map, save_map
 from mapstream.recordings.maps.build import add_resources, with_poses
 from mapstream.recordings.maps.history import change_map, redo, undo
 from mapstream.recordings.maps.manifest import read_manifest
+from mapstream.recordings.maps.model import TABLES
 from mapstream.streams.errors import MapCheckError, MapError, MapFormatError
 from mapstream.streams.geometry import SE3
 from mapstream.streams.messages.estimates import PointCloud
@@ -104,7 +105,7 @@ def test_a_run_that_saves_begins_anew(tmp_path: Path) -> None:
 
     with pytest.raises(MapError, match="nothing to undo; what runs and imports write stays"):
         undo(tmp_path)
-    assert len(list((tmp_path / "tables").iterdir())) == 9
+    assert len(list((tmp_path / "tables").iterdir())) == len(TABLES)
 
 
 def test_a_change_that_breaks_the_rules_is_not_saved(tmp_path: Path) -> None:

@@ -19,10 +19,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mapstream.recordings.maps import Map, load_map, save_map
+from mapstream.recordings.maps.columns import Column, columns_of
 from mapstream.recordings.maps.combine import with_journal_entry
 from mapstream.recordings.maps.folder import LOCK, FolderLock
 from mapstream.recordings.maps.model import TABLES, from_tables
-from mapstream.recordings.maps.tables import Column, columns_of
 from mapstream.streams.errors import MapError, MapFormatError
 from tests.full_disk import largest_file
 from tests.recordings.made_maps import files_under, full_map, line_map
@@ -64,7 +64,10 @@ def any_column(column: Column, num_rows: int, rng: np.random.Generator) -> npt.N
 
 
 @settings(max_examples=6, deadline=None)
-@given(st.integers(0, 2**32 - 1), st.lists(st.integers(0, 6), min_size=9, max_size=9))
+@given(
+    st.integers(0, 2**32 - 1),
+    st.lists(st.integers(0, 6), min_size=len(TABLES), max_size=len(TABLES)),
+)
 def test_S1_whatever_a_map_holds_comes_back(
     tmp_path_factory: pytest.TempPathFactory, seed: int, sizes: list[int]
 ) -> None:
@@ -119,7 +122,7 @@ def test_a_save_writes_changed_tables_and_leaves_no_others(tmp_path: Path) -> No
     after = {path: path.stat().st_mtime_ns for path in (tmp_path / "tables").iterdir()}
     [changed] = after.items() - before.items()
     assert changed[0].name.startswith("vertices-")
-    assert len(after) == len(before) == 9
+    assert len(after) == len(before) == len(TABLES)
     assert map_.digest() == full_map().digest()  # though its file is gone
 
 
@@ -208,7 +211,9 @@ def test_S1_M19_a_killed_save_leaves_the_old_map_or_the_new_one(tmp_path: Path) 
 
     assert run.returncode == 0, run.stdout + run.stderr
     save_map(line_map(2), folder)
-    assert len(list((folder / "tables").iterdir())) == 9  # leftovers of the killed are gone
+    assert len(list((folder / "tables").iterdir())) == len(
+        TABLES
+    )  # leftovers of the killed are gone
 
 
 def test_a_map_can_be_read_while_it_is_saved(tmp_path: Path) -> None:
@@ -250,10 +255,10 @@ def test_a_folder_without_a_map_is_refused(tmp_path: Path) -> None:
 
 def test_another_version_is_refused(tmp_path: Path) -> None:
     save_map(line_map(2), tmp_path)
-    edit_manifest(tmp_path, version=3)
+    edit_manifest(tmp_path, version=4)
 
     with pytest.raises(
-        MapFormatError, match="format version 3, but this mapstream reads version 2"
+        MapFormatError, match="format version 4, but this mapstream reads version 3"
     ):
         load_map(tmp_path)
 

@@ -13,8 +13,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from pydantic import BaseModel, ConfigDict, PositiveFloat, PositiveInt
 
+from mapstream.recordings.maps.columns import BoolArray
 from mapstream.recordings.maps.model import Map
-from mapstream.recordings.maps.tables import BoolArray
 from mapstream.streams.arrays import FloatArray, IntArray
 
 _KINDS = ("absolute", "position")

@@ -20,8 +20,8 @@ from mapstream.operators.estimation.outliers.consistency import (
     mahalanobis,
     odometry_chain,
 )
+from mapstream.recordings.maps.columns import BoolArray
 from mapstream.recordings.maps.model import Map
-from mapstream.recordings.maps.tables import BoolArray
 from mapstream.streams.arrays import FloatArray, IntArray
 from mapstream.streams.geometry import invert, se3_log
 
