@@ -36,6 +36,7 @@ BUILT_IN = {
     "map_store": "mapstream.operators.sinks.map_store:MapStore",
     "mcap": "mapstream.operators.sources.mcap:McapSource",
     "mcap_sink": "mapstream.operators.sinks.mcap:McapSink",
+    "n_frames": "mapstream.operators.tracking.n_frames:NFrames",
     "odometry_adapter": "mapstream.operators.odometry.odometry_adapter:OdometryAdapter",
     "odometry_file": "mapstream.operators.sources.odometry_file:OdometryFile",
     "odometry_guard": "mapstream.operators.odometry.odometry_guard:OdometryGuard",

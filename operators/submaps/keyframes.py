@@ -13,6 +13,7 @@ from mapstream.streams.arrays import FloatArray
 from mapstream.streams.channel import Receiver, Sender
 from mapstream.streams.errors import EstimationError
 from mapstream.streams.messages.estimates import Keyframe, Odometry, PointCloud
+from mapstream.streams.messages.vision import NFrame
 from mapstream.streams.sync import exact
 from mapstream.streams.triggers import AnyOf, OnMotion, Periodic, Trigger
 
@@ -31,10 +32,11 @@ class KeyframesConfig(OperatorConfig):
 
 @dataclass(frozen=True)
 class Inputs:
-    """Odometry, and the clouds that have its stamps."""
+    """Odometry, and the clouds and n-frames that have its stamps."""
 
     odometry: Receiver[Odometry]
     clouds: Receiver[PointCloud] | None
+    n_frames: Receiver[NFrame] | None
 
 
 @dataclass(frozen=True)
@@ -64,14 +66,14 @@ class Keyframes(Operator[Inputs, Outputs]):
     async def run(self, inputs: Inputs, outputs: Outputs) -> None:
         waiting: Keyframe | None = None  # the newest moment, not kept so far
         num_unknown = 0
-        async for odometry, cloud in _moments(inputs):
+        async for odometry, cloud, n_frame in _moments(inputs):
             if self._previous is None and odometry.is_lost:
                 num_unknown += 1
                 continue
             if self._previous is not None and odometry.stamp_ns <= self._previous.stamp_ns:
                 report_loss("moments whose stamp does not increase")
                 continue
-            keyframe = self.moment(odometry, cloud)
+            keyframe = self.moment(odometry, cloud, n_frame)
             waiting = keyframe
             if self._trigger.fires(odometry.stamp_ns, odometry.T_odom_base):
                 self._covariance, self._was_lost = np.zeros((6, 6)), False
@@ -85,7 +87,9 @@ class Keyframes(Operator[Inputs, Outputs]):
                 " its warnings say why"
             )
 
-    def moment(self, odometry: Odometry, cloud: PointCloud | None) -> Keyframe:
+    def moment(
+        self, odometry: Odometry, cloud: PointCloud | None, n_frame: NFrame | None = None
+    ) -> Keyframe:
         """Return the keyframe that this moment would be."""
         if self._previous is None:
             covariance = None
@@ -101,7 +105,11 @@ class Keyframes(Operator[Inputs, Outputs]):
         records = (cloud.record,) if cloud is not None and cloud.record is not None else ()
         since_kept = replace(odometry, covariance=covariance, is_lost=self._was_lost)
         return Keyframe(
-            stamp_ns=odometry.stamp_ns, odometry=since_kept, cloud=cloud, records=records
+            stamp_ns=odometry.stamp_ns,
+            odometry=since_kept,
+            cloud=cloud,
+            records=records,
+            features=() if n_frame is None else n_frame.features,
         )
 
 
@@ -112,14 +120,14 @@ def _trigger(config: KeyframesConfig) -> Trigger:
     return AnyOf(triggers)
 
 
-async def _moments(inputs: Inputs) -> AsyncIterator[tuple[Odometry, PointCloud | None]]:
-    """Yield odometry with its cloud; without clouds, alone."""
-    if inputs.clouds is None:
-        async for odometry in inputs.odometry:
-            yield odometry, None
-        return
-    pairs = exact(inputs.odometry, inputs.clouds)
-    async for odometry, cloud in pairs:
-        yield odometry, cloud
-    if pairs.stats.unmatched:
-        warn(pairs.explain())
+async def _moments(
+    inputs: Inputs,
+) -> AsyncIterator[tuple[Odometry, PointCloud | None, NFrame | None]]:
+    """Yield odometry with the cloud and the n-frame of its stamp, as far as they are connected."""
+    connected = [r for r in (inputs.odometry, inputs.clouds, inputs.n_frames) if r is not None]
+    moments = exact(*connected)
+    async for odometry, *seen in moments:
+        cloud = seen[0] if inputs.clouds is not None else None
+        yield odometry, cloud, seen[-1] if inputs.n_frames is not None else None
+    if moments.stats.unmatched:
+        warn(moments.explain())

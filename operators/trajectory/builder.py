@@ -15,7 +15,7 @@ import numpy as np
 from mapstream.operators.odometry.continuous import Motion
 from mapstream.operators.trajectory.dead_reckoning import LEVELLING_NS, DeadReckoning
 from mapstream.operators.trajectory.links import Links
-from mapstream.operators.trajectory.window import CommitWindow
+from mapstream.operators.trajectory.window import CommitWindow, Seen, View
 from mapstream.streams.errors import EstimationError
 from mapstream.streams.join import END
 from mapstream.streams.messages.constraints import Constraint
@@ -67,12 +67,13 @@ class TrajectoryBuilder:
         """Ask for a pose at a stamp; asking twice gives one pose."""
         self._at(stamp_ns)
 
-    def see(self, cloud: PointCloud) -> None:
-        """Ask for a pose where a cloud was seen, which the keyframe then holds."""
-        if self._out and cloud.stamp_ns <= self._out[-1]:
-            self.lost["clouds that came after their time went out"] += 1
+    def see(self, seen: Seen) -> None:
+        """Ask for a pose where a cloud or an n-frame was seen, which the keyframe then holds."""
+        if self._out and seen.stamp_ns <= self._out[-1]:
+            what = "clouds" if isinstance(seen, PointCloud) else "n-frames"
+            self.lost[f"{what} that came after their time went out"] += 1
         else:
-            self._window.see(cloud)
+            self._window.see(seen)
 
     def add(self, constraint: Constraint) -> None:
         """Take a measurement in, and ask for the pose that it is on."""
@@ -111,12 +112,12 @@ class TrajectoryBuilder:
         for stamp_ns in self.ready(known_ns):
             if stamp_ns > up_to_ns:
                 break
-            measured, cloud = self._window.take(stamp_ns)
+            measured, view = self._window.take(stamp_ns)
             if self._links.is_outside(stamp_ns):
                 self.lost["measurements before or after all that is known of motion"] += 1
                 continue
             edges += self._reach(stamp_ns)
-            keyframes.append(self._keyframe(stamp_ns, cloud))
+            keyframes.append(self._keyframe(stamp_ns, view))
             constraints += measured
         if len(keyframes) == len(repeated) and not splices and not late:
             return None
@@ -157,10 +158,13 @@ class TrajectoryBuilder:
         self._out.append(stamp_ns)
         return edges
 
-    def _keyframe(self, stamp_ns: int, cloud: PointCloud | None = None) -> Keyframe:
+    def _keyframe(self, stamp_ns: int, view: View = (None, ())) -> Keyframe:
+        cloud, features = view
         records = (cloud.record,) if cloud is not None and cloud.record is not None else ()
         odometry = self._reckoning.at(stamp_ns)
-        return Keyframe(stamp_ns=stamp_ns, odometry=odometry, cloud=cloud, records=records)
+        return Keyframe(
+            stamp_ns=stamp_ns, odometry=odometry, cloud=cloud, records=records, features=features
+        )
 
     def _split_what_is_out(self) -> tuple[list[Splice], list[Constraint]]:
         """Return splices for late measurements, and those that are on a pose which exists."""

@@ -102,7 +102,7 @@ SourceConfig = Annotated[OdometryConfig | WheelConfig | StillConfig, Field(discr
 
 
 class TrajectoryConfig(OperatorConfig):
-    """Options of `trajectory`: each source, each name under `constraints`, `imu` and `clouds` is an input."""
+    """Options of `trajectory`: inputs are sources, names under `constraints`, `imu`, `clouds`, `n_frames`."""
 
     sources: dict[str, SourceConfig] = Field(default_factory=dict)
     """Sources of motion by name; the first that knows an interval gives the first guess."""
@@ -114,6 +114,8 @@ class TrajectoryConfig(OperatorConfig):
     """Sensors whose place an optimizer finds, by the name that their measurements give."""
     clouds: bool = False
     """An input `clouds`: poses are made where clouds are, and keep them."""
+    n_frames: bool = False
+    """An input `n_frames`: poses are made where features of cameras are, and keep them."""
     bridge: Literal["none", "still", "constant_velocity"] = "still"
     """What links poses between which nothing was measured; `none` makes that an error."""
     period_s: PositiveFloat | None = 1.0
@@ -137,14 +139,12 @@ class TrajectoryConfig(OperatorConfig):
 
     @model_validator(mode="after")
     def _check_names(self) -> TrajectoryConfig:
-        names = [*self.sources, *self.constraints, "imu", "clouds"]
+        names = [*self.sources, *self.constraints, "imu", "clouds", "n_frames"]
         twice = sorted({name for name in names if names.count(name) > 1})
         if twice:
             raise ValueError(f"two inputs are called {twice[0]}; give each a name of its own")
-        if {"imu", "sources"} & set(self.mounts):
-            raise ValueError(
-                "a mount is called neither imu nor sources; the map keeps others there"
-            )
+        if taken := {"imu", "sources", "cameras"} & set(self.mounts):
+            raise ValueError(f"a mount is not called {taken.pop()}: the map keeps others there")
         return self
 
     def described(self, T_base_imu: SE3) -> str:

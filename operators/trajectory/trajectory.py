@@ -30,9 +30,11 @@ from mapstream.streams.join import END
 from mapstream.streams.messages.constraints import Constraint
 from mapstream.streams.messages.estimates import Odometry, PointCloud, Submap
 from mapstream.streams.messages.sensors import ImuBatch, Message, WheelOdometry
+from mapstream.streams.messages.vision import NFrame
 from mapstream.streams.sync import merge
 
 _SECOND_NS = 1_000_000_000
+_SEEN = ("clouds", "n_frames")  # inputs whose messages poses keep
 
 
 @dataclass(frozen=True)
@@ -59,6 +61,7 @@ class Trajectory(DynamicPorts, Operator[Ports, Outputs]):
         self._sources = {name: source_of(each, keep_ns) for name, each in config.sources.items()}
         self._imu = None if config.imu is None else imu_source_of(config.imu, keep_ns)
         self._trigger = trigger_of(config)
+        self._triggers = {port: trigger_of(config) for port in _SEEN}
         self._T_odom_base = SE3.identity()  # the newest pose that the trigger was told
         self._builder: TrajectoryBuilder | None = None
         self._now_ns = -END
@@ -77,6 +80,8 @@ class Trajectory(DynamicPorts, Operator[Ports, Outputs]):
             inputs["imu"] = ImuBatch
         if config.clouds:
             inputs["clouds"] = PointCloud
+        if config.n_frames:
+            inputs["n_frames"] = NFrame
         return inputs | dict.fromkeys(config.constraints, Constraint), {}
 
     async def run(self, inputs: Ports, outputs: Outputs) -> None:
@@ -131,14 +136,14 @@ class Trajectory(DynamicPorts, Operator[Ports, Outputs]):
         if isinstance(message, Constraint):
             if self._is_due(port, message.stamp_ns):
                 self.builder.add(message)
-        elif isinstance(message, PointCloud):
-            self._see(message)
+        elif isinstance(message, PointCloud | NFrame):
+            self._see(port, message)
         elif not self._add(port, message):
             report_loss(f"messages of {port} whose stamp does not increase")
             return
         if self._config.waits or not isinstance(message, Constraint):
             self._now_ns = max(self._now_ns, message.stamp_ns)
-        if port == self._pace and not isinstance(message, PointCloud):
+        if port == self._pace and port not in _SEEN:
             if isinstance(message, Odometry | WheelOdometry):
                 self._T_odom_base = message.T_odom_base
             if self._trigger.fires(message.stamp_ns, self._T_odom_base):
@@ -189,17 +194,16 @@ class Trajectory(DynamicPorts, Operator[Ports, Outputs]):
     @property
     def _pace(self) -> str | None:
         """The input whose messages decide where poses are made that nothing asks for."""
-        if self._config.clouds:
-            return "clouds"
         inputs, _ = self.ports_for(self._config)
-        return next((name for name in inputs if name not in self._config.constraints), None)
+        candidates = [name for name in inputs if name not in self._config.constraints]
+        return next((name for name in (*_SEEN, *candidates) if name in candidates), None)
 
-    def _see(self, cloud: PointCloud) -> None:
+    def _see(self, port: str, seen: PointCloud | NFrame) -> None:
         first = next(iter(self._sources.values()), None)
-        if first is not None and first.covers(cloud.stamp_ns, cloud.stamp_ns):
-            self._T_odom_base = first.state_at(cloud.stamp_ns).T_odom_base
-        if self._trigger.fires(cloud.stamp_ns, self._T_odom_base):
-            self.builder.see(cloud)
+        if first is not None and first.covers(seen.stamp_ns, seen.stamp_ns):
+            self._T_odom_base = first.state_at(seen.stamp_ns).T_odom_base
+        if self._triggers[port].fires(seen.stamp_ns, self._T_odom_base):
+            self.builder.see(seen)
 
     def _add(self, port: str, message: Message) -> bool:
         """Feed a source; return False if it is not newer than what it knows."""

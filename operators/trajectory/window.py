@@ -7,6 +7,11 @@ from bisect import insort
 from mapstream.streams.join import END
 from mapstream.streams.messages.constraints import Constraint
 from mapstream.streams.messages.estimates import PointCloud
+from mapstream.streams.messages.vision import ImageFeatures, NFrame
+
+Seen = PointCloud | NFrame
+View = tuple[PointCloud | None, tuple[ImageFeatures, ...]]
+"""What a pose sees: a cloud, and features of cameras."""
 
 
 class CommitWindow:
@@ -17,7 +22,7 @@ class CommitWindow:
         self._window_ns = window_ns
         self._stamps_ns: list[int] = []  # in order
         self._constraints: dict[int, list[Constraint]] = {}
-        self._clouds: dict[int, PointCloud] = {}
+        self._seen: dict[int, View] = {}
 
     def __len__(self) -> int:
         return len(self._stamps_ns)
@@ -29,10 +34,14 @@ class CommitWindow:
             self._constraints[stamp_ns] = []
         return self._constraints[stamp_ns]
 
-    def see(self, cloud: PointCloud) -> None:
-        """Ask for a pose where a cloud was seen."""
-        self.ask(cloud.stamp_ns)
-        self._clouds[cloud.stamp_ns] = cloud
+    def see(self, seen: Seen) -> None:
+        """Ask for a pose where a cloud or an n-frame was seen."""
+        self.ask(seen.stamp_ns)
+        cloud, features = self._seen.get(seen.stamp_ns, (None, ()))
+        if isinstance(seen, PointCloud):
+            self._seen[seen.stamp_ns] = (seen, features)
+        else:
+            self._seen[seen.stamp_ns] = (cloud, seen.features)
 
     def waited(self, known_ns: int) -> list[int]:
         """Return the stamps that waited long enough, in order.
@@ -47,7 +56,7 @@ class CommitWindow:
         last_ns = known_ns - self._window_ns
         return [stamp_ns for stamp_ns in self._stamps_ns if stamp_ns <= last_ns]
 
-    def take(self, stamp_ns: int) -> tuple[list[Constraint], PointCloud | None]:
-        """Return what was measured at the oldest stamp, and forget it."""
+    def take(self, stamp_ns: int) -> tuple[list[Constraint], View]:
+        """Return what was measured and what was seen at the oldest stamp, and forget it."""
         self._stamps_ns.remove(stamp_ns)
-        return self._constraints.pop(stamp_ns), self._clouds.pop(stamp_ns, None)
+        return self._constraints.pop(stamp_ns), self._seen.pop(stamp_ns, (None, ()))
