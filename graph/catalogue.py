@@ -34,6 +34,7 @@ BUILT_IN = {
     "kiss_odometry": "mapstream.operators.odometry.kiss_odometry:KissOdometry",
     "lidar_loops": "mapstream.operators.lidar.loops:LidarLoops",
     "map_store": "mapstream.operators.sinks.map_store:MapStore",
+    "map_steps": "mapstream.operators.maps.steps:MapSteps",
     "mcap": "mapstream.operators.sources.mcap:McapSource",
     "mcap_sink": "mapstream.operators.sinks.mcap:McapSink",
     "n_frames": "mapstream.operators.tracking.n_frames:NFrames",

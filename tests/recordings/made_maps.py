@@ -113,7 +113,7 @@ def full_map() -> Map:
         kind=np.array(["orb", "sift"], dtype=object),
         dtype=np.array(["uint8", "float32"], dtype=object),
         width=np.array([2, 1]),
-        descriptors=np.array([b"\x01\x02", np.float32([1, 2]).tobytes()], dtype=object),
+        descriptors=np.array([b"\x01\x02", np.ones(2, np.float32).tobytes()], dtype=object),
     )
     observations = Observations(
         vertex=np.array([0, 1, 2, 3, 3]),

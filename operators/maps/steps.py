@@ -1,0 +1,110 @@
+"""Map tools one after another inside a graph: what is done to each map that comes.
+
+Source: Cramariuc et al., maplab 2.0, RA-L 2023, section III-C ("a configurable set of operations").
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from importlib import import_module
+from typing import Any, ClassVar, get_type_hints
+
+from pydantic import BaseModel, Field, ValidationError, model_validator
+
+from mapstream.operators.operator import Operator, OperatorConfig, Placement, offload
+from mapstream.recordings.maps.combine import with_journal_entry
+from mapstream.recordings.maps.model import Map
+from mapstream.streams.channel import Receiver, Sender
+
+Tool = Callable[[Map, Any], tuple[Map, Any]]
+"""From a map and the tool's config to a new map and a report."""
+
+TOOLS = {
+    "fix_stationary": "mapstream.operators.maps.stationary:fix_stationary",
+    "optimize": "mapstream.operators.estimation.batch:optimize_map",
+}
+"""By the name that graph files use; what is imported is imported when a graph uses it."""
+
+
+class MapStep(OperatorConfig):
+    """One tool and its options."""
+
+    tool: str
+    config: dict[str, Any] = Field(default_factory=dict)
+    """As `mapstream map DIR TOOL --set` takes them."""
+
+    @model_validator(mode="after")
+    def _is_a_tool_with_its_options(self) -> MapStep:
+        if self.tool not in TOOLS:
+            raise ValueError(f"no map tool {self.tool!r}; there are {', '.join(sorted(TOOLS))}")
+        try:
+            prepared(self)
+        except ValidationError as error:
+            first = error.errors()[0]
+            key = ".".join(map(str, first["loc"]))
+            raise ValueError(f"{self.tool}: {key}: {first['msg']}") from error
+        return self
+
+
+class MapStepsConfig(OperatorConfig):
+    """Options of `map_steps`."""
+
+    steps: tuple[MapStep, ...] = Field(min_length=1)
+    """In the order in which they are done."""
+
+
+@dataclass(frozen=True)
+class Inputs:
+    """Maps as they grow, or one at the end."""
+
+    maps: Receiver[Map]
+
+
+@dataclass(frozen=True)
+class Outputs:
+    """Each map after all steps."""
+
+    maps: Sender[Map]
+
+
+class MapSteps(Operator[Inputs, Outputs]):
+    """Do the same steps to each map that comes; its journal tells them."""
+
+    placement: ClassVar[Placement] = "process"  # gtsam holds the interpreter for its whole call
+    spans_epochs: ClassVar[bool] = True
+
+    def __init__(self, config: MapStepsConfig) -> None:
+        self._steps = [(step, *prepared(step)) for step in config.steps]
+
+    async def run(self, inputs: Inputs, outputs: Outputs) -> None:
+        async for map_ in inputs.maps:
+            await outputs.maps.send(await offload(self.worked_on, map_))
+
+    def worked_on(self, map_: Map) -> Map:
+        """Return the map after all steps.
+
+        Raises:
+            MappingError: If a tool refuses the map.
+        """
+        for step, tool, config in self._steps:
+            map_, _ = tool(map_, config)
+            map_ = with_journal_entry(map_, step.tool, **step.config)
+        return map_
+
+
+def prepared(step: MapStep) -> tuple[Tool, BaseModel]:
+    """Return the function behind a step, and its options.
+
+    Raises:
+        ValidationError: If an option is not one.
+    """
+    module, _, name = TOOLS[step.tool].partition(":")
+    tool = getattr(import_module(module), name)
+    hint = get_type_hints(tool)["config"]
+    config_type = next(t for t in (hint, *getattr(hint, "__args__", ())) if _is_config(t))
+    return tool, config_type.model_validate(step.config)
+
+
+def _is_config(found: object) -> bool:
+    return isinstance(found, type) and issubclass(found, BaseModel)

@@ -1,0 +1,45 @@
+"""Map tools in a graph, by name and with their options."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+from pydantic import BaseModel, ValidationError
+
+from mapstream.operators.estimation.batch import OptimizeConfig
+from mapstream.operators.maps.steps import TOOLS, MapStep, MapSteps, MapStepsConfig, prepared
+from mapstream.operators.testing import run_operator
+from tests.recordings.made_maps import line_map
+
+pytestmark = pytest.mark.anyio
+
+
+async def test_L6_steps_are_done_in_order_and_the_journal_tells_them() -> None:
+    steps = [
+        {"tool": "fix_stationary", "config": {"max_distance_m": 50.0, "max_angle_rad": 3.0}},
+        {"tool": "optimize", "config": {"max_iterations": 5}},
+    ]
+    config = MapStepsConfig.model_validate({"steps": steps})
+
+    [made] = (await run_operator(MapSteps(config), maps=[line_map(6)]))["maps"]
+
+    assert made.journal.operation.tolist() == ["fix_stationary", "optimize"]
+    assert json.loads(made.journal.parameters[1]) == {"max_iterations": 5}
+    assert "stationary" in made.edges.source.tolist()
+
+
+@pytest.mark.parametrize("tool", TOOLS)
+def test_every_tool_is_there_with_a_config_of_its_own(tool: str) -> None:
+    function, config = prepared(MapStep(tool=tool))
+
+    assert callable(function)
+    assert isinstance(config, BaseModel)
+
+
+def test_a_wrong_step_is_refused_where_it_stands() -> None:
+    with pytest.raises(ValidationError, match="no map tool 'optimise'; there are"):
+        MapStep(tool="optimise")
+    with pytest.raises(ValidationError, match="optimize: max_iteration: Extra inputs"):
+        MapStep(tool="optimize", config={"max_iteration": 3})
+    assert isinstance(prepared(MapStep(tool="optimize"))[1], OptimizeConfig)
