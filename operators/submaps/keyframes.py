@@ -6,9 +6,10 @@ from collections.abc import AsyncIterator
 from dataclasses import dataclass, replace
 
 import numpy as np
-from pydantic import PositiveFloat
+from pydantic import Field, PositiveFloat
 
 from mapstream.operators.operator import Operator, OperatorConfig, report_loss, warn
+from mapstream.operators.submaps.overlap import Overlap
 from mapstream.streams.arrays import FloatArray
 from mapstream.streams.channel import Receiver, Sender
 from mapstream.streams.errors import EstimationError
@@ -25,6 +26,8 @@ class KeyframesConfig(OperatorConfig):
     rotation_rad: PositiveFloat = 0.35
     period_s: PositiveFloat | None = None
     """Time since the last keyframe, also while the robot stands still."""
+    overlap: float = Field(default=0.0, ge=0.0, lt=1.0)
+    """The least share of the last keyframe's feature tracks that is still seen; 0: that does not matter."""
     odometry_sigma_rad: PositiveFloat = 0.002
     """Uncertainty of a step where the odometry says nothing."""
     odometry_sigma_m: PositiveFloat = 0.01
@@ -59,6 +62,7 @@ class Keyframes(Operator[Inputs, Outputs]):
         sigmas = [config.odometry_sigma_rad] * 3 + [config.odometry_sigma_m] * 3
         self._default_covariance = np.diag(np.square(sigmas))
         self._trigger = _trigger(config)
+        self._overlap = Overlap(config.overlap)
         self._previous: Odometry | None = None  # the last message
         self._covariance: FloatArray = np.zeros((6, 6))  # from the last keyframe to the previous
         self._was_lost = False
@@ -75,7 +79,10 @@ class Keyframes(Operator[Inputs, Outputs]):
                 continue
             keyframe = self.moment(odometry, cloud, n_frame)
             waiting = keyframe
-            if self._trigger.fires(odometry.stamp_ns, odometry.T_odom_base):
+            pose = (odometry.stamp_ns, odometry.T_odom_base)
+            if self._trigger.is_due(*pose) or self._overlap.is_lost(n_frame):
+                self._trigger.restart(*pose)
+                self._overlap.restart(n_frame)
                 self._covariance, self._was_lost = np.zeros((6, 6)), False
                 waiting = None
                 await outputs.keyframes.send(keyframe)

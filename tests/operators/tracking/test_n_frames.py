@@ -118,3 +118,27 @@ async def test_A14_a_trajectory_keeps_features_of_cameras_at_poses_of_any_odomet
     assert check_map(map_) == []
     assert map_.vertices.stamp_ns.tolist() == stamps_ns[::4]
     assert len(map_.observations) == 3 * len(map_.vertices)
+
+
+async def test_G7_a_keyframe_is_kept_when_too_few_tracks_are_left() -> None:
+    stamps_ns = [i * PERIOD_NS for i in range(1, 12)]
+
+    def seen(number: int) -> NFrame:
+        features_ = ImageFeatures(
+            stamp_ns=stamps_ns[number],
+            kind="klt",
+            frame="left",
+            keypoints_px=np.zeros((10, 2), np.float32),
+            track_ids=np.arange(10) + number,
+        )
+        return NFrame(stamp_ns=stamps_ns[number], features=(features_,))
+
+    config = KeyframesConfig(distance_m=100, rotation_rad=3, overlap=0.7)
+    sent = await run_operator(
+        Keyframes(config),
+        odometry=[odometry(s) for s in stamps_ns],
+        n_frames=[seen(n) for n in range(len(stamps_ns))],
+    )
+
+    kept = [stamps_ns.index(k.stamp_ns) for k in sent["keyframes"]]
+    assert kept == [0, 4, 8, 10]  # with 6 of 10 tracks left; the last moment always
