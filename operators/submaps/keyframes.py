@@ -10,6 +10,7 @@ from pydantic import Field, PositiveFloat
 
 from mapstream.operators.operator import Operator, OperatorConfig, report_loss, warn
 from mapstream.operators.submaps.overlap import Overlap
+from mapstream.operators.submaps.records import records_of
 from mapstream.streams.arrays import FloatArray
 from mapstream.streams.channel import Receiver, Sender
 from mapstream.streams.errors import EstimationError
@@ -109,14 +110,14 @@ class Keyframes(Operator[Inputs, Outputs]):
             self._was_lost |= odometry.is_lost
             covariance = self._covariance.copy()
         self._previous = odometry
-        records = (cloud.record,) if cloud is not None and cloud.record is not None else ()
+        features = () if n_frame is None else n_frame.features
         since_kept = replace(odometry, covariance=covariance, is_lost=self._was_lost)
         return Keyframe(
             stamp_ns=odometry.stamp_ns,
             odometry=since_kept,
             cloud=cloud,
-            records=records,
-            features=() if n_frame is None else n_frame.features,
+            records=records_of(cloud, features),
+            features=features,
         )
 
 

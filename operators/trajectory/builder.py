@@ -13,6 +13,7 @@ from collections import Counter
 import numpy as np
 
 from mapstream.operators.odometry.continuous import Motion
+from mapstream.operators.submaps.records import records_of
 from mapstream.operators.trajectory.dead_reckoning import LEVELLING_NS, DeadReckoning
 from mapstream.operators.trajectory.links import Links
 from mapstream.operators.trajectory.window import CommitWindow, Seen, View
@@ -160,10 +161,13 @@ class TrajectoryBuilder:
 
     def _keyframe(self, stamp_ns: int, view: View = (None, ())) -> Keyframe:
         cloud, features = view
-        records = (cloud.record,) if cloud is not None and cloud.record is not None else ()
         odometry = self._reckoning.at(stamp_ns)
         return Keyframe(
-            stamp_ns=stamp_ns, odometry=odometry, cloud=cloud, records=records, features=features
+            stamp_ns=stamp_ns,
+            odometry=odometry,
+            cloud=cloud,
+            records=records_of(cloud, features),
+            features=features,
         )
 
     def _split_what_is_out(self) -> tuple[list[Splice], list[Constraint]]:
