@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import tempfile
 from importlib.metadata import version
 from pathlib import Path
@@ -10,6 +9,7 @@ from typing import Any
 
 from mapstream.graph.cli.output import fraction_bar
 from mapstream.graph.cli.simulate import write_world
+from mapstream.recordings.cache import cache_folder
 from mapstream.recordings.datasets.catalogue import convert
 from mapstream.recordings.worlds.catalogue import WORLDS
 from mapstream.streams.errors import RecordingError
@@ -49,10 +49,3 @@ def converted(kind: str, package: str) -> Path:
     except OSError as error:
         raise RecordingError(f"{folder}: cannot be written: {error}; set XDG_CACHE_HOME") from error
     return file
-
-
-def cache_folder() -> Path:
-    """Return where recordings are kept that can be made again (XDG base directories)."""
-    base = os.environ.get("XDG_CACHE_HOME", "")
-    root = Path(base) if Path(base).is_absolute() else Path.home() / ".cache"
-    return root / "mapstream"

@@ -68,3 +68,16 @@ class NFrame:
 
     stamp_ns: int  # of the first camera; the others differ by less than a tolerance
     features: tuple[ImageFeatures, ...]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class GlobalDescriptor:
+    """What a whole image looks like, as one vector: those of the same place have a large dot product."""
+
+    stamp_ns: int
+    kind: str  # the network; descriptors of different kinds never meet
+    frame: str  # the camera
+    vector: Float32Array  # (D,) of unit length
+
+    def __post_init__(self) -> None:
+        frozen(self, "vector", np.float32, (None,))

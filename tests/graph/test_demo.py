@@ -10,6 +10,7 @@ import pytest
 
 from mapstream.graph.cli import demo_data
 from mapstream.graph.unused_positions import unused_position_errors
+from mapstream.recordings.cache import cache_folder
 from mapstream.recordings.maps import Map
 from mapstream.recordings.maps.build import append_edges, new_mission
 from mapstream.recordings.maps.ids import derived_id, id_array, mission_id
@@ -56,7 +57,7 @@ def test_the_cache_is_in_the_home_unless_the_environment_says_where(
     for value in ("", "relative/paths/do/not/count"):
         monkeypatch.setenv("XDG_CACHE_HOME", value)
 
-        assert demo_data.cache_folder() == Path.home() / ".cache" / "mapstream"
+        assert cache_folder() == Path.home() / ".cache" / "mapstream"
 
 
 def straight_map(*used_s: int) -> Map:
