@@ -18,13 +18,22 @@ _FLAGS = {
     "color": cv2.IMREAD_COLOR,
     "gray": cv2.IMREAD_GRAYSCALE,
     "as_recorded": cv2.IMREAD_UNCHANGED,
+    "depth": cv2.IMREAD_UNCHANGED,
 }
+_SEEN = {  # by dtype and number of dimensions
+    ("uint8", 3): "bgr8",
+    ("uint8", 2): "mono8",
+    ("uint16", 2): "mono16",
+    ("float32", 2): "32FC1",
+}
+_DEPTH = {("uint16", 2): "16UC1", ("float32", 2): "32FC1"}
 
 
 class ImageDecodeConfig(OperatorConfig):
-    mode: Literal["color", "gray", "as_recorded"] = Field(
+    mode: Literal["color", "gray", "as_recorded", "depth"] = Field(
         default="as_recorded",
-        description="color is bgr8, gray is mono8; 16 bits stay only as recorded",
+        description="color is bgr8, gray is mono8; 16 bits stay only as recorded (mono16) and as depth"
+        " (16UC1, millimetres)",
     )
     on_wrong_size: WrongSize = Field(
         default="drop",
@@ -53,6 +62,7 @@ class ImageDecode(Operator[Inputs, Outputs]):
 
     def __init__(self, config: ImageDecodeConfig) -> None:
         self._flag = _FLAGS[config.mode]
+        self._encodings = _DEPTH if config.mode == "depth" else _SEEN
         self._on_wrong_size = config.on_wrong_size
 
     async def run(self, inputs: Inputs, outputs: Outputs) -> None:
@@ -77,8 +87,8 @@ class ImageDecode(Operator[Inputs, Outputs]):
             return _undecodable(image, image.format)
         if pixels.ndim == 3 and pixels.shape[2] == 4:
             pixels = np.ascontiguousarray(pixels[:, :, :3])  # without alpha
-        encoding = "bgr8" if pixels.ndim == 3 else _GRAY.get(pixels.dtype.name)
-        if encoding is None or (pixels.ndim == 3 and pixels.dtype != np.uint8):
+        encoding = self._encodings.get((pixels.dtype.name, pixels.ndim))
+        if encoding is None:
             return _undecodable(image, f"{image.format} of {pixels.dtype}")
         frame = CameraFrame(
             stamp_ns=image.stamp_ns,
@@ -91,9 +101,6 @@ class ImageDecode(Operator[Inputs, Outputs]):
         )
         result = fitted(frame, self._on_wrong_size)
         return _Refused(image.stamp_ns, result) if isinstance(result, str) else result
-
-
-_GRAY = {"uint8": "mono8", "uint16": "mono16", "float32": "32FC1"}
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,10 +8,13 @@ from pathlib import Path
 
 from mapstream.recordings.datasets.conversion import Convert, Notices, Progress
 from mapstream.recordings.datasets.described_csv import convert_csv
+from mapstream.recordings.datasets.eqvio import convert_eqvio, eqvio_file
 from mapstream.recordings.datasets.euroc import convert_euroc
 from mapstream.recordings.datasets.kitti import convert_kitti
 from mapstream.recordings.datasets.kitti_inertial import convert_kitti_inertial, gtsam_data
 from mapstream.recordings.datasets.lidar_bins import convert_lidar_bins
+from mapstream.recordings.datasets.seven_scenes import convert_seven_scenes
+from mapstream.recordings.datasets.tum_rgbd import convert_tum_rgbd
 from mapstream.recordings.mcap_whole import whole_mcap
 from mapstream.recordings.mcap_writer import McapWriter
 from mapstream.recordings.odometry_files import read_odometry
@@ -47,10 +50,20 @@ def convert_rosbag(source: Path, writer: McapWriter, on_progress: Progress) -> N
         return tuple(f"lost at byte {loss.offset}: {loss.reason}" for loss in recording.losses)
 
 
+def convert_tum(source: Path, writer: McapWriter, on_progress: Progress) -> Notices:
+    """Write a folder of colour and depth, or a trajectory."""
+    return (convert_tum_rgbd if source.is_dir() else convert_odometry)(source, writer, on_progress)
+
+
 CONVERTERS = {
     "csv": Converter("CSV whose header names IMU, GNSS, odometry, positions", convert_csv),
+    "eqvio": Converter(
+        "30 s of EuRoC V1_01 as feature tracks and IMU from the installed gtsam; needs no PATH",
+        convert_eqvio,
+        eqvio_file,
+    ),
     "euroc": Converter("folder of a EuRoC sequence", convert_euroc),
-    "kitti": Converter("folder of KITTI odometry scans", convert_kitti),
+    "kitti": Converter("folder of KITTI odometry: scans, images or both", convert_kitti),
     "kitti00-gtsam": Converter(
         "470 s of IMU and GPS from the installed gtsam; needs no PATH",
         convert_kitti_inertial,
@@ -58,7 +71,8 @@ CONVERTERS = {
     ),
     "lidar_bins": Converter("folder of deskewed scans with alidarPose.csv", convert_lidar_bins),
     "rosbag": Converter("ROS 1 bag, rosbag2 or MCAP", convert_rosbag),
-    "tum": Converter("TUM trajectory", convert_odometry),
+    "tum": Converter("folder of a TUM RGB-D sequence, or a TUM trajectory", convert_tum),
+    "7scenes": Converter("folder of a 7-Scenes sequence", convert_seven_scenes),
 }
 
 

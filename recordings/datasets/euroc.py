@@ -14,8 +14,6 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
-
 from mapstream.recordings.attached_rig import attach_rig
 from mapstream.recordings.datasets.conversion import (
     Notices,
@@ -25,11 +23,11 @@ from mapstream.recordings.datasets.conversion import (
     write_in_order,
 )
 from mapstream.recordings.datasets.euroc_sensors import read_rig
+from mapstream.recordings.datasets.image_files import image_of
 from mapstream.recordings.mcap_writer import McapWriter
 from mapstream.recordings.number_tables import read_stamped_table
 from mapstream.recordings.odometry_files import read_odometry
 from mapstream.streams.errors import RecordingError
-from mapstream.streams.messages.sensors import EncodedImage
 
 _IMU_HEADER = "#timestamp [ns],w_RS_S_x"
 
@@ -104,15 +102,9 @@ def _images(folder: Path) -> Iterator[Topical]:
         stamp, _, name = line.partition(",")
         path = folder / "data" / name.strip()
         try:
-            content, stamp_ns = path.read_bytes(), int(stamp)
-        except (OSError, ValueError) as error:
+            image = image_of(path, int(stamp), folder.name)
+        except (RecordingError, ValueError) as error:
             raise RecordingError(
                 f"{listing}:{number}: expected a stamp and a file: {error}"
             ) from error
-        image = EncodedImage(
-            stamp_ns=stamp_ns,
-            data=np.frombuffer(content, np.uint8),
-            format=path.suffix.lower().removeprefix(".").replace("jpg", "jpeg"),
-            frame=folder.name,
-        )
         yield f"/{folder.name}/image", image

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 
+from mapstream.recordings.datasets.opencv_yaml import read_opencv_yaml
 from mapstream.recordings.maps.ids import derived_id
 from mapstream.streams.calibration import CameraCalibration
 from mapstream.streams.fields import Fields
@@ -26,7 +27,7 @@ def read_rig(folders: Sequence[Path]) -> tuple[Rig | None, tuple[str, ...]]:
     places: list[Extrinsics] = []
     notices: list[str] = []
     for folder in folders:
-        fields = _fields(folder / "sensor.yaml")
+        fields = read_opencv_yaml(folder / "sensor.yaml")
         kind = fields.text("sensor_type")
         if kind not in ("imu", "camera"):
             notices.append(f"{folder.name}: sensors of type {kind} are not read")
@@ -39,13 +40,6 @@ def read_rig(folders: Sequence[Path]) -> tuple[Rig | None, tuple[str, ...]]:
     if all(sensor.id != _BODY for sensor in sensors):
         return None, (*notices, "no sensor.yaml of the IMU: places and noise are not known")
     return Rig(sensors, places), tuple(notices)
-
-
-def _fields(path: Path) -> Fields:
-    content = path.read_bytes()
-    if content.startswith(b"%YAML:"):  # OpenCV's way to say it, which is no YAML
-        content = b"#" + content
-    return Fields.of_bytes(content, path)
 
 
 def _place(fields: Fields) -> SE3:

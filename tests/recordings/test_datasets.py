@@ -156,7 +156,7 @@ def test_a_failed_conversion_leaves_the_old_file(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("name", "content", "message"),
     [
-        ("times.txt", "0.0\n", r"times\.txt: expected a time for each of 2 scans, found 1"),
+        ("times.txt", "0.0\n", r"times\.txt: expected a time for each of 2 frames, found 1"),
         ("calib.txt", "P0: 1\n", r"calib\.txt: expected a line 'Tr: \.\.\.'"),
         ("calib.txt", "Tr: 1 2\n", r"calib\.txt: Tr: expected 12 numbers"),
         ("poses.txt", "1 2 3\n", r"poses\.txt:1: expected 12 numbers, found 3"),

@@ -44,10 +44,12 @@ async def test_depth_of_16_bits_and_gray_stay_as_recorded() -> None:
 
     as_recorded = await run_operator(ImageDecode(ImageDecodeConfig()), images=images)
     gray = await run_operator(ImageDecode(ImageDecodeConfig(mode="gray")), images=images[1:])
+    in_mm = await run_operator(ImageDecode(ImageDecodeConfig(mode="depth")), images=images)
 
     assert [f.encoding for f in as_recorded["frames"]] == ["mono16", "mono8", "bgr8"]
     np.testing.assert_array_equal(as_recorded["frames"][0].image, depth)
     assert [f.encoding for f in gray["frames"]] == ["mono8", "mono8"]
+    assert [f.encoding for f in in_mm["frames"]] == ["16UC1"]
 
 
 async def test_an_image_that_cannot_be_decoded_is_counted_and_the_rest_goes_on() -> None:
