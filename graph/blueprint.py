@@ -69,8 +69,10 @@ def map_blueprint(path: FloatArray) -> rrb.Blueprint:
         look_target=middle,
         eye_up=(0.0, 0.0, 1.0),
     )
-    time = rrb.TimePanel(timeline="stamp", state="hidden")
-    return rrb.Blueprint(map_view([], eye), time, *_CLOSED)
+    time = rrb.TimePanel(timeline="stamp", state="collapsed")
+    states = rrb.TimeSeriesView(name="States", origin="/states")
+    main = rrb.Tabs(map_view([], eye), states)
+    return rrb.Blueprint(main, time, *_CLOSED)
 
 
 def map_view(outputs: Sequence[Output], eye: rrb.EyeControls3D | None = None) -> rrb.Spatial3DView:

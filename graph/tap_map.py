@@ -4,17 +4,25 @@ from __future__ import annotations
 
 import time
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from mapstream.graph.tap_sinks import Sink
 from mapstream.operators.maps.aggregate import AggregateConfig, aggregate_cloud
 from mapstream.recordings.maps import Map
-from mapstream.streams.errors import MapError
+from mapstream.recordings.maps.records import record_rows, recorded
+from mapstream.streams.errors import DecodeError, MapError, RecordingError
+from mapstream.streams.messages.sensors import CameraFrame, EncodedImage
+
+if TYPE_CHECKING:
+    from mapstream.graph.views import Scene
 
 _PATH = "map"
 _VOXEL_SIZE_M = 0.2  # a voxel of the cloud is a pixel or less where one sees a whole map
 _FLUSH_S = 60.0
+_MAX_PICTURES = 500  # of one mission
+_PICTURES_AT_ONCE = 20
 
 
 def view_map(
@@ -51,7 +59,31 @@ def view_map(
             raise MapError("rerun: no viewer answered; start one with `rerun`, or try save=FILE")
         time.sleep(0.2)
     sink.draw(_PATH, drawing, stamp_ns=map_.stamp_ns, sequence=0)
+    for mission in range(len(map_.missions)):
+        notes += _draw_pictures(map_, mission, sink, scene)
     if not sink.flush(_FLUSH_S):
         raise MapError(f"rerun: the viewer did not take the map within {_FLUSH_S:.0f} s")
     sink.close()
     return notes
+
+
+def _draw_pictures(map_: Map, mission: int, sink: Sink, scene: Scene) -> list[str]:
+    """Draw what a mission's cameras saw, where the recording is at hand; return what is missing."""
+    from mapstream.graph.views import view_of  # noqa: PLC0415  # imports rerun
+    from mapstream.graph.views.drive import picture_path  # noqa: PLC0415
+
+    rows = record_rows(map_, mission)
+    rows = rows[:: max(1, len(rows) // _MAX_PICTURES)]
+    try:
+        for sequence, (row, message) in enumerate(recorded(map_, rows)):
+            if not isinstance(message, CameraFrame | EncodedImage):
+                continue
+            path = picture_path(map_, mission, message.frame, map_.resources.topic[row])
+            stamp_ns = int(map_.vertices.stamp_ns[map_.resources.vertex[row]])
+            drawing = view_of(message)(message, scene)
+            sink.draw(path, drawing, stamp_ns=stamp_ns, sequence=sequence)
+            if sequence % _PICTURES_AT_ONCE == 0 and not sink.flush(_FLUSH_S):
+                raise MapError(f"rerun: the viewer did not take pictures within {_FLUSH_S:.0f} s")
+    except (RecordingError, DecodeError) as error:
+        return [f"rerun: the map is drawn without pictures: {error}"]
+    return []

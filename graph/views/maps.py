@@ -8,9 +8,11 @@ import rerun as rr
 from mapstream.graph.views.ceiling import without_ceiling
 from mapstream.graph.views.colors import switch_colors
 from mapstream.graph.views.constraints import place_frames
+from mapstream.graph.views.drive import drive_entries
 from mapstream.graph.views.growing import LINE, MAP_PATH, redraw_loops, redraw_mission
 from mapstream.graph.views.landmarks import landmark_entries
 from mapstream.graph.views.lidar import height_colors
+from mapstream.graph.views.observers import observer_entries
 from mapstream.graph.views.outer_frames import outer_frame_entries
 from mapstream.graph.views.scene import Columns, Drawing, Entry, Scene, Vertex
 from mapstream.recordings.maps import Map
@@ -21,7 +23,11 @@ _QUIET = ("odometry", "imu", "loop")  # along the trajectory, or drawn with the 
 
 
 def view_map(map_: Map, scene: Scene) -> Drawing:
-    """Draw each mission's trajectory, loops by switch value, other edges and landmarks by kind, outer frames."""
+    """Draw all that a map holds.
+
+    That is each mission's trajectory, robot and states, loops by switch value, other edges and landmarks by kind,
+    from where landmarks were seen, and outer frames.
+    """
     drawing: list[Entry | Columns] = []
     for row in range(len(map_.missions)):
         vertices = map_.vertices_of(row)
@@ -32,7 +38,8 @@ def view_map(map_: Map, scene: Scene) -> Drawing:
         ends = _vertex(map_, edges.vertex_a[edge]), _vertex(map_, edges.vertex_b[edge])
         scene.loops[ends] = float(edges.switch[edge])
     drawing += [*redraw_loops(scene), *place_frames(map_)]
-    return [*drawing, *_edges(map_), *landmark_entries(map_), *outer_frame_entries(map_)]
+    drawing += [*_edges(map_), *landmark_entries(map_), *observer_entries(map_)]
+    return [*drawing, *outer_frame_entries(map_), *drive_entries(map_)]
 
 
 def cloud_entry(map_: Map, cloud: PointCloud, scene: Scene) -> Entry:
