@@ -32,6 +32,7 @@ BUILT_IN = {
     "imu_biases": "mapstream.operators.imu.biases:ImuBiases",
     "keyframes": "mapstream.operators.submaps.keyframes:Keyframes",
     "kiss_odometry": "mapstream.operators.odometry.kiss_odometry:KissOdometry",
+    "klt": "mapstream.operators.tracking.klt:Klt",
     "lidar_loops": "mapstream.operators.lidar.loops:LidarLoops",
     "map_store": "mapstream.operators.sinks.map_store:MapStore",
     "map_steps": "mapstream.operators.maps.steps:MapSteps",

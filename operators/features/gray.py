@@ -1,0 +1,42 @@
+"""Images as detectors and trackers want them: 8 bits of grey."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from mapstream.operators.operator import report_loss
+from mapstream.streams.messages.sensors import CameraFrame
+
+GrayImage = npt.NDArray[np.uint8]
+
+
+def gray(frame: CameraFrame) -> GrayImage:
+    """Return an image (H, W) of 8 bits; 16 bits and floats are stretched over what the image holds."""
+    image: npt.NDArray[Any] = frame.image
+    if frame.encoding == "bgr8":
+        image = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
+    elif frame.encoding == "rgb8":
+        image = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+    elif image.dtype != np.uint8:
+        image = cv2.normalize(np.nan_to_num(image), np.empty(0), 0, 255, cv2.NORM_MINMAX, cv2.CV_8U)
+    return np.ascontiguousarray(image, np.uint8)
+
+
+def has_calibrated_size(frame: CameraFrame) -> bool:
+    """Return whether an image is as large as its calibration says; count it as lost if not.
+
+    Keypoints of another size would be rays in wrong directions.
+    """
+    camera = frame.camera
+    height, width = frame.image.shape[:2]
+    if camera is None or (width, height) == (camera.width_px, camera.height_px):
+        return True
+    report_loss(
+        f"images of {frame.frame} with {width} x {height} px, though it is calibrated for "
+        f"{camera.width_px} x {camera.height_px} px; resize them, or correct the calibration"
+    )
+    return False
