@@ -10,7 +10,7 @@ from typing import Annotated
 
 import typer
 
-from mapstream.graph.cli.demo_data import converted, simulated
+from mapstream.graph.cli.dataset_cache import converted
 from mapstream.graph.cli.evaluate import compare
 from mapstream.graph.cli.output import (
     ExitCode,
@@ -24,11 +24,13 @@ from mapstream.graph.cli.output import (
 from mapstream.graph.cli.planning import Request, plan_request
 from mapstream.graph.cli.run_report import print_report, report_as_json
 from mapstream.graph.cli.running import execute
+from mapstream.graph.cli.simulate import write_world
 from mapstream.graph.problems import did_you_mean
 from mapstream.graph.trajectory_sources import read_trajectory
 from mapstream.graph.unused_positions import unused_position_errors
 from mapstream.recordings.evaluation import Statistics
 from mapstream.recordings.maps import check_map, load_map
+from mapstream.recordings.worlds.catalogue import WORLDS
 from mapstream.streams.errors import ConfigError
 
 
@@ -65,12 +67,14 @@ def _against_unused_positions(folder: Path, recording: Path) -> Judgement:
 
 
 def _corridor(folder: Path, seed: int) -> Path:
+    recording = folder / "drive.mcap"
     options = {"length_m": 80.0, "lidar": {"columns": 360}}
-    return simulated("w_lid", options, folder / "drive.mcap", seed)
+    write_world("w_lid", recording, WORLDS["w_lid"].config_type.model_validate(options), seed=seed)
+    return recording
 
 
 def _kitti00(folder: Path, seed: int) -> Path:  # noqa: ARG001  # it lies in the cache, and is real
-    return converted("kitti00-gtsam", "gtsam")
+    return converted("kitti00-gtsam")
 
 
 def _inertial_params(recording: Path) -> dict[str, str]:  # noqa: ARG001  # as other demos ask it

@@ -8,6 +8,7 @@ from typing import Annotated
 
 import typer
 
+from mapstream.graph.cli.dataset_cache import converted
 from mapstream.graph.cli.output import (
     JsonFlag,
     ParamList,
@@ -33,6 +34,13 @@ def run(  # noqa: PLR0913  # one for each option of the command
     graph: Annotated[str, typer.Argument(help="A graph file, or the name of a preset.")],
     recording: Annotated[Path | None, typer.Argument(help="The recording to read.")] = None,
     *,
+    dataset: Annotated[
+        str | None,
+        typer.Option(
+            help="A data set in the place of a recording, as `mapstream convert` names it: euroc:DIR, "
+            "kitti:DIR ... It is converted once, into the cache."
+        ),
+    ] = None,
     map_: Annotated[Path | None, typer.Option("--map", help="The folder of the map.")] = None,
     param: ParamList = None,
     set_: SetList = None,
@@ -55,6 +63,9 @@ def run(  # noqa: PLR0913  # one for each option of the command
     json: JsonFlag = False,
 ) -> None:
     """Run a graph. Ctrl-C stops the sources, finishes what is under way and saves; again: quits."""
+    if dataset is not None and recording is not None:
+        raise typer.BadParameter("--dataset takes the place of the recording; give one of them")
+    recording = recording if dataset is None else converted(dataset)
     params = given(param, "--param")
     if map_ is not None:
         params["map"] = str(map_)

@@ -102,20 +102,29 @@ def convert(
     """
     converter, source = _parsed(spec)
     out = Path(out)
-    if not source.exists():
-        raise ConfigError(f"{spec}: there is nothing at {source}")
     with whole_mcap(out) as writer:
         notices = converter.convert(source, writer, on_progress or (lambda _: None))
     return Conversion(out, writer.num_messages, notices)
 
 
+def source_of(spec: str) -> Path:
+    """Return the file or folder that a spec names.
+
+    Raises:
+        ConfigError: If the kind is unknown, or there is nothing at the place.
+        RecordingError: If it should be installed and is not.
+    """
+    return _parsed(spec)[1]
+
+
 def _parsed(spec: str) -> tuple[Converter, Path]:
     kind, colon, place = spec.partition(":")
     converter = CONVERTERS.get(kind)
-    if converter is not None and colon:
-        return converter, Path(place)
-    if converter is not None and converter.installed is not None:
-        return converter, converter.installed()
+    if converter is not None and (colon or converter.installed is not None):
+        source = Path(place) if colon or converter.installed is None else converter.installed()
+        if not source.exists():
+            raise ConfigError(f"{spec}: there is nothing at {source}")
+        return converter, source
     kinds = ", ".join(
         f"{name}:PATH" if found.installed is None else name for name, found in CONVERTERS.items()
     )

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mapstream.graph.cli import demo_data
+from mapstream.graph.cli.dataset_cache import converted
 from mapstream.graph.unused_positions import unused_position_errors
 from mapstream.recordings.cache import cache_folder
 from mapstream.recordings.maps import Map
@@ -33,10 +33,10 @@ def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def test_an_installed_data_set_is_converted_once(cache: Path) -> None:
-    made = demo_data.converted("kitti00-gtsam", "gtsam")
+    made = converted("kitti00-gtsam")
     time_ns = made.stat().st_mtime_ns
 
-    again = demo_data.converted("kitti00-gtsam", "gtsam")
+    again = converted("kitti00-gtsam")
 
     assert again == made
     assert again.stat().st_mtime_ns == time_ns
@@ -48,7 +48,7 @@ def test_a_cache_that_cannot_be_written_is_named(cache: Path) -> None:
     cache.write_text("a file where the folder should be")
 
     with pytest.raises(RecordingError, match=r"mapstream: cannot be written.*set XDG_CACHE_HOME"):
-        demo_data.converted("kitti00-gtsam", "gtsam")
+        converted("kitti00-gtsam")
 
 
 def test_the_cache_is_in_the_home_unless_the_environment_says_where(

@@ -19,9 +19,7 @@ from mapstream.streams.errors import ConfigError, RecordingError
 from mapstream.streams.geometry import SE3
 from mapstream.streams.sensors import ImuSensor
 from tests.data import shared
-
-_GRAY = np.arange(48, dtype=np.uint8).reshape(6, 8)
-_DEPTH = np.array([[0, 5000, 65535], [10000, 1, 2500]], np.uint16)
+from tests.recordings import made_datasets
 
 
 def decoded(path: Path, topic: str) -> list[Any]:
@@ -50,17 +48,12 @@ def depth_mm(message: Any) -> list[list[int]]:  # noqa: ANN401
 
 @pytest.fixture
 def kitti(tmp_path: Path) -> Path:
-    folder = tmp_path / "07"
-    for name in ("image_0", "image_1"):
-        (folder / name).mkdir(parents=True)
-        for index in range(2):
-            cv2.imwrite(str(folder / name / f"{index:06d}.png"), _GRAY + index)
-    (folder / "calib.txt").write_text(
-        "P0: 700 0 4 0 0 700 3 0 0 0 1 0\nP1: 700 0 4 -350 0 700 3 0 0 0 1 0\n"
-        "Tr: 0 -1 0 0 0 0 -1 0 1 0 0 -0.3\n"
-    )
-    (folder / "poses.txt").write_text("1 0 0 0 0 1 0 0 0 0 1 0\n1 0 0 0 0 1 0 0 0 0 1 2\n")
-    return folder
+    return made_datasets.kitti(tmp_path / "07")
+
+
+@pytest.fixture
+def tum(tmp_path: Path) -> Path:
+    return made_datasets.tum(tmp_path)
 
 
 def test_A24_kitti_stereo_is_rectified_cameras_with_their_baseline(
@@ -104,19 +97,6 @@ def test_kitti_folders_that_do_not_fit_together_are_refused(kitti: Path, tmp_pat
     (kitti / "calib.txt").unlink()
     with pytest.raises(RecordingError, match="expected the projections of the cameras"):
         convert(f"kitti:{kitti}", tmp_path / "out.mcap")
-
-
-@pytest.fixture
-def tum(tmp_path: Path) -> Path:
-    folder = tmp_path / "rgbd_dataset_freiburg1_tiny"
-    (folder / "rgb").mkdir(parents=True)
-    (folder / "depth").mkdir()
-    cv2.imwrite(str(folder / "rgb" / "a.png"), _GRAY)
-    cv2.imwrite(str(folder / "depth" / "a.png"), _DEPTH)
-    (folder / "rgb.txt").write_text("# color images\n1305031102.175304 rgb/a.png\n")
-    (folder / "depth.txt").write_text("# depth maps\n1305031102.160407 depth/a.png\n")
-    (folder / "groundtruth.txt").write_text("# t\n1305031102.1600 1 2 3 0 0 0 1\n")
-    return folder
 
 
 def test_A24_tum_folder_with_the_published_calibration(tum: Path, tmp_path: Path) -> None:
@@ -182,13 +162,7 @@ def test_a_tum_folder_whose_camera_nobody_knows_is_refused(tum: Path, tmp_path: 
 def test_A24_seven_scenes_has_two_cameras_and_the_poses_of_the_depth_camera(
     tmp_path: Path,
 ) -> None:
-    scene = tmp_path / "scene"
-    scene.mkdir()
-    for index in range(2):
-        cv2.imwrite(str(scene / f"frame-{index:06d}.color.png"), _GRAY)
-        cv2.imwrite(str(scene / f"frame-{index:06d}.depth.png"), _DEPTH)
-    (scene / "frame-000000.pose.txt").write_text("1 0 0 1\n0 1 0 2\n0 0 1 3\n0 0 0 1\n")
-    (scene / "frame-000001.pose.txt").write_text("\t".join(["NaN"] * 16))
+    scene = made_datasets.seven_scenes(tmp_path / "scene")
 
     done = convert(f"7scenes:{scene}", tmp_path / "out.mcap")
 
