@@ -10,8 +10,10 @@ from pathlib import Path
 import numpy as np
 
 from mapstream.operators.maps.aggregate import AggregateConfig, aggregate_cloud
+from mapstream.operators.maps.colmap import colmap_model
 from mapstream.operators.maps.csv_tables import write_tables
 from mapstream.recordings.cloud_files import write_pcd, write_ply
+from mapstream.recordings.colmap import write_model
 from mapstream.recordings.g2o import write_g2o
 from mapstream.recordings.maps.edge_kinds import RELATIVE_KINDS
 from mapstream.recordings.maps.model import Map
@@ -34,16 +36,16 @@ class ExportReport:
 
     files: tuple[Path, ...]
     written: dict[str, int] = field(default_factory=dict)  # poses, edges, points, rows by table
-    left_out: dict[str, int] = field(default_factory=dict)  # edges by kind
+    left_out: dict[str, int] = field(default_factory=dict)  # edges by kind, images by camera
 
 
 def export_map(map_: Map, folder: Path, path: Path, config: ExportConfig) -> ExportReport:
-    """Write a map as `.tum`, `.kitti`, `.csv` (EuRoC), `.g2o`, `.ply`, `.pcd` or `.mcap`, or as CSV tables, in the map frame.
+    """Write a map as `.tum`, `.kitti`, `.csv` (EuRoC), `.g2o`, `.colmap`, `.ply`, `.pcd`, `.mcap` or CSV tables.
 
     Args:
         map_: The map.
         folder: Where it lies, for its clouds.
-        path: The file; of several missions, trajectories get a file each, with the mission in its name.
+        path: The file, in the map frame; of several missions, trajectories get a file each, with the mission in its name.
             Without a suffix it is a folder, which gets a CSV file per table.
         config: See there.
 
@@ -93,6 +95,14 @@ def _csv_tables(map_: Map, folder: Path, path: Path, config: ExportConfig) -> Ex
     written = write_tables(map_, path)
     rows = {file.stem: count for file, count in written.items()}
     return ExportReport(files=tuple(written), written=rows)
+
+
+def _colmap(map_: Map, folder: Path, path: Path, config: ExportConfig) -> ExportReport:  # noqa: ARG001
+    model, left_out = colmap_model(map_)
+    if not model.images:
+        raise MapError(f"{path}: the map has no images of cameras that COLMAP knows")
+    written = {"images": len(model.images), "points": len(model.points)}
+    return ExportReport(files=write_model(model, path), written=written, left_out=dict(left_out))
 
 
 def _ply(map_: Map, folder: Path, path: Path, config: ExportConfig) -> ExportReport:
@@ -158,6 +168,7 @@ EXPORTERS: dict[str, Callable[[Map, Path, Path, ExportConfig], ExportReport]] = 
     ".kitti": _kitti,
     ".csv": _euroc,
     ".g2o": _g2o,
+    ".colmap": _colmap,
     ".ply": _ply,
     ".pcd": _pcd,
     ".mcap": _mcap,

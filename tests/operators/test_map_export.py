@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from mapstream.operators.maps.export import EXPORTERS, ExportConfig, export_map
-from mapstream.operators.maps.import_ import ImportConfig, import_map
+from mapstream.operators.maps.import_ import import_map
+from mapstream.operators.maps.trajectory_map import ImportConfig
 from mapstream.recordings.cloud_files import read_pcd, read_ply
 from mapstream.recordings.cloud_store import CloudStore
 from mapstream.recordings.decoding import decoder_for
@@ -120,7 +121,7 @@ def test_S6_poses_and_edges_go_into_a_recording(tmp_path: Path) -> None:
 
 
 def test_unknown_formats_are_refused(tmp_path: Path) -> None:
-    known = r"known are \.tum, \.kitti, \.csv, \.g2o, \.ply, \.pcd, \.mcap"
+    known = r"known are \.tum, \.kitti, \.csv, \.g2o, \.colmap, \.ply, \.pcd, \.mcap"
     with pytest.raises(MapError, match=rf"map\.las: unknown format '\.las'; {known}"):
         export_map(full_map(), tmp_path, tmp_path / "map.las", CONFIG)
     with pytest.raises(
@@ -131,7 +132,7 @@ def test_unknown_formats_are_refused(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("suffix", [s for s in EXPORTERS if s not in (".g2o", ".mcap", "")])
 def test_an_empty_map_has_nothing_to_write(suffix: str, tmp_path: Path) -> None:
-    with pytest.raises(MapError, match=r"no poses to write|there are no clouds"):
+    with pytest.raises(MapError, match=r"no poses to write|there are no clouds|has no images"):
         export_map(Map.empty(), tmp_path, tmp_path / f"map{suffix}", CONFIG)
 
     assert not list(tmp_path.iterdir())

@@ -11,7 +11,8 @@ from mapstream.graph.cli.map.look import print_statistics
 from mapstream.graph.cli.options import KeySetList, config_from
 from mapstream.graph.cli.output import JsonFlag, in_place, say, say_json
 from mapstream.operators.maps.export import KNOWN, ExportConfig, export_map
-from mapstream.operators.maps.import_ import IMPORTERS, ImportConfig, import_map
+from mapstream.operators.maps.import_ import IMPORTERS, import_map
+from mapstream.operators.maps.trajectory_map import ImportConfig
 from mapstream.recordings.maps import load_map, require_valid, save_map
 from mapstream.recordings.maps.combine import with_journal_entry
 from mapstream.recordings.maps.store import MANIFEST
@@ -34,8 +35,8 @@ def export_(
     content = ", ".join(f"{count} {what}" for what, count in report.written.items())
     for path in report.files if file.suffix else (file,):
         say(f"wrote {in_place(path)}: {content}")
-    for kind, count in report.left_out.items():
-        say(f"left out: {count} edges of kind {kind}, which {file.suffix} has no place for")
+    for what, count in report.left_out.items():
+        say(f"left out: {what} ({count}), which {file.suffix} has no place for")
 
 
 def import_(
