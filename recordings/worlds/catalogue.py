@@ -9,10 +9,12 @@ from typing import Any
 
 from pydantic import BaseModel, ValidationError
 
+from mapstream.recordings.attached_rig import attach_rig
 from mapstream.recordings.mcap_whole import whole_mcap
 from mapstream.recordings.worlds.simulation import Simulation
 from mapstream.recordings.worlds.w_lid import WLidConfig, w_lid
 from mapstream.recordings.worlds.w_pan import WPanConfig, w_pan
+from mapstream.recordings.worlds.w_vi import WViConfig, w_vi
 from mapstream.streams.errors import ConfigError
 
 
@@ -27,6 +29,7 @@ class World:
 
 WORLDS = {
     "w_lid": World("a loop of corridors, LiDAR, IMU, drifting odometry", WLidConfig, w_lid),
+    "w_vi": World("a hall, five cameras, IMU, drifting odometry, GPS and tags", WViConfig, w_vi),
     "w_pan": World("a room, a depth camera that pans and tilts, /tf", WPanConfig, w_pan),
 }
 
@@ -67,6 +70,8 @@ def simulate(
     simulation = world.simulate(config, seed)
     span_ns = simulation.end_ns - simulation.start_ns
     with whole_mcap(path) as writer:
+        if simulation.rig is not None:
+            attach_rig(writer, simulation.rig)
         for record in simulation.records:
             writer.write(record.topic, record.message, record.log_ns)
             if on_progress is not None:

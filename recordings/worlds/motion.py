@@ -45,6 +45,11 @@ class Motion:
         T[:, 3, 3] = 1
         return T
 
+    def velocities(self, stamps_ns: IntArray) -> FloatArray:
+        """Return velocities of the base (N, 3) [m/s] in the world frame."""
+        velocities: FloatArray = self._spline((stamps_ns - self.start_ns) / 1e9, nu=1)[:, :3]
+        return velocities
+
     def angular_velocity(self, stamps_ns: IntArray) -> FloatArray:
         """Return turn rates (N, 3) [rad/s] in the base frame."""
         before, after = self._poses(stamps_ns - _STEP_NS), self._poses(stamps_ns + _STEP_NS)

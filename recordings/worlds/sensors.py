@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, NonNegativeFloat, PositiveFloat, PositiveInt
@@ -92,28 +93,63 @@ class Lidar:
         )
 
 
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class ImuSeries:
+    """What an IMU measured, and the biases it had."""
+
+    stamps_ns: IntArray  # (N,)
+    gyro_radps: FloatArray  # (N, 3)
+    accel_mps2: FloatArray  # (N, 3)
+    gyro_biases_radps: FloatArray  # (N, 3)
+    accel_biases_mps2: FloatArray  # (N, 3)
+    T_base_sensor: SE3
+
+    def batches(self) -> Iterator[ImuBatch]:
+        """Yield a tenth of a second at a time."""
+        period_ns = int(self.stamps_ns[1] - self.stamps_ns[0])
+        size = max(1, 10**8 // period_ns)
+        for start in range(0, len(self.stamps_ns), size):
+            rows = slice(start, start + size)
+            yield ImuBatch(
+                stamps_ns=self.stamps_ns[rows],
+                gyro_radps=self.gyro_radps[rows],
+                accel_mps2=self.accel_mps2[rows],
+                T_base_sensor=self.T_base_sensor,
+            )
+
+
+def imu_series(
+    config: ImuConfig,
+    T_base_sensor: SE3,
+    motion: Motion,
+    span_ns: tuple[int, int],
+    rng: np.random.Generator,
+) -> ImuSeries:
+    """Return the samples from a time to another, both included."""
+    stamps_ns = np.arange(span_ns[0], span_ns[1] + 1, round(1e9 / config.rate_hz))
+    shape, rate_hz = (len(stamps_ns), 3), config.rate_hz
+    gyro_biases = _bias(config.gyro_bias_radps, config.gyro_walk_radps2_rthz, rate_hz, shape, rng)
+    gyro_radps = motion.angular_velocity(stamps_ns) @ T_base_sensor.R + gyro_biases
+    gyro_radps += rng.normal(0.0, config.gyro_noise_radps_rthz * np.sqrt(rate_hz), shape)
+    accel_biases = _bias(config.accel_bias_mps2, config.accel_walk_mps3_rthz, rate_hz, shape, rng)
+    accel_mps2 = motion.specific_force(stamps_ns, T_base_sensor) + accel_biases
+    accel_mps2 += rng.normal(0.0, config.accel_noise_mps2_rthz * np.sqrt(rate_hz), shape)
+    return ImuSeries(
+        stamps_ns=stamps_ns,
+        gyro_radps=gyro_radps,
+        accel_mps2=accel_mps2,
+        gyro_biases_radps=gyro_biases,
+        accel_biases_mps2=accel_biases,
+        T_base_sensor=T_base_sensor,
+    )
+
+
 def imu_batches(
     config: ImuConfig, T_base_sensor: SE3, motion: Motion, rng: np.random.Generator
 ) -> Iterator[ImuBatch]:
     """Yield the samples of a whole motion, a tenth of a second at a time."""
-    period_ns = round(1e9 / config.rate_hz)
-    stamps_ns = np.arange(motion.start_ns, motion.end_ns + 1, period_ns)
-    shape, rate_hz = (len(stamps_ns), 3), config.rate_hz
-    gyro_radps = motion.angular_velocity(stamps_ns) @ T_base_sensor.R
-    gyro_radps += _bias(config.gyro_bias_radps, config.gyro_walk_radps2_rthz, rate_hz, shape, rng)
-    gyro_radps += rng.normal(0.0, config.gyro_noise_radps_rthz * np.sqrt(rate_hz), shape)
-    accel_mps2 = motion.specific_force(stamps_ns, T_base_sensor)
-    accel_mps2 += _bias(config.accel_bias_mps2, config.accel_walk_mps3_rthz, rate_hz, shape, rng)
-    accel_mps2 += rng.normal(0.0, config.accel_noise_mps2_rthz * np.sqrt(rate_hz), shape)
-    size = max(1, 10**8 // period_ns)
-    for start in range(0, len(stamps_ns), size):
-        rows = slice(start, start + size)
-        yield ImuBatch(
-            stamps_ns=stamps_ns[rows],
-            gyro_radps=gyro_radps[rows],
-            accel_mps2=accel_mps2[rows],
-            T_base_sensor=T_base_sensor,
-        )
+    span_ns = (motion.start_ns, motion.end_ns)
+    return imu_series(config, T_base_sensor, motion, span_ns, rng).batches()
 
 
 def _bias(
@@ -125,16 +161,23 @@ def _bias(
 
 
 def drifting_odometry(
-    poses: FloatArray, stamps_ns: IntArray, drift: float, rng: np.random.Generator
+    poses: FloatArray,
+    stamps_ns: IntArray,
+    drift: float,
+    rng: np.random.Generator,
+    *,
+    turn_radpm: float = 0.0,
 ) -> Iterator[Odometry]:
     """Yield odometry whose error grows by about `drift` of the distance.
 
-    Every step is stretched by a fixed factor, and turned by a random walk of the heading.
+    Every step is stretched by a fixed factor, and turned by a random walk of the heading, and by
+    `turn_radpm` for each metre.
     """
     steps = invert(poses[:-1]) @ poses[1:]
     lengths = np.linalg.norm(steps[:, :3, 3], axis=1)
     errors = np.zeros((len(steps), 6))
     errors[:, 2] = rng.normal(0.0, 0.1 * drift, len(steps)) * np.sqrt(lengths)
+    errors[:, 2] += turn_radpm * lengths
     steps[:, :3, 3] *= 1 + drift * rng.choice([-1, 1])
     T = poses[0]
     yield Odometry(stamp_ns=int(stamps_ns[0]), T_odom_base=SE3(T))

@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 from mapstream.streams.messages.sensors import Message
+from mapstream.streams.rig import Rig
 
 
 @dataclass(frozen=True, slots=True)
@@ -24,3 +25,4 @@ class Simulation:
     start_ns: int
     end_ns: int
     records: Iterator[Record]  # log times do not decrease
+    rig: Rig | None = None  # what the recording says of its sensors
