@@ -142,10 +142,16 @@ def _observations(map_: Map) -> Columns:
         "vertex": seen.vertex,
         "landmark": seen.landmark,
         "sensor": seen.sensor,
+        "kind": seen.kind,
+        "track": seen.track,
         "offset_ns": seen.offset_ns,
         **_named(("u_px", "v_px"), seen.keypoint_px),
         **_named(_axes("{}_sensor_m"), seen.p_sensor),
         "sigma": seen.sigma,
+        "sigma_m": seen.sigma_m,
+        "score": seen.score,
+        "scale_px": seen.scale,
+        "orientation_rad": seen.orientation_rad,
     }
 
 
