@@ -11,6 +11,7 @@ import numpy as np
 from mapstream.graph.tap_sinks import Sink
 from mapstream.operators.maps.aggregate import AggregateConfig, aggregate_cloud
 from mapstream.recordings.maps import Map
+from mapstream.recordings.maps.cameras import cameras_of
 from mapstream.recordings.maps.records import record_rows, recorded
 from mapstream.streams.errors import DecodeError, MapError, RecordingError
 from mapstream.streams.messages.sensors import CameraFrame, EncodedImage
@@ -68,10 +69,12 @@ def view_map(
 
 
 def _draw_pictures(map_: Map, mission: int, sink: Sink, scene: Scene) -> list[str]:
-    """Draw what a mission's cameras saw, where the recording is at hand; return what is missing."""
+    """Draw what a mission's cameras saw, where the recording is at hand, and the map over it; return what is missing."""
     from mapstream.graph.views import view_of  # noqa: PLC0415  # imports rerun
     from mapstream.graph.views.drive import picture_path  # noqa: PLC0415
+    from mapstream.graph.views.overlay import overlay_entries  # noqa: PLC0415
 
+    cameras = cameras_of(map_, mission)
     rows = record_rows(map_, mission)
     rows = rows[:: max(1, len(rows) // _MAX_PICTURES)]
     try:
@@ -79,8 +82,11 @@ def _draw_pictures(map_: Map, mission: int, sink: Sink, scene: Scene) -> list[st
             if not isinstance(message, CameraFrame | EncodedImage):
                 continue
             path = picture_path(map_, mission, message.frame, map_.resources.topic[row])
-            stamp_ns = int(map_.vertices.stamp_ns[map_.resources.vertex[row]])
-            drawing = view_of(message)(message, scene)
+            vertex = int(map_.resources.vertex[row])
+            stamp_ns = int(map_.vertices.stamp_ns[vertex])
+            drawing = [*view_of(message)(message, scene)]
+            if camera := cameras.get(message.frame):
+                drawing += overlay_entries(map_, camera, message.frame, vertex)
             sink.draw(path, drawing, stamp_ns=stamp_ns, sequence=sequence)
             if sequence % _PICTURES_AT_ONCE == 0 and not sink.flush(_FLUSH_S):
                 raise MapError(f"rerun: the viewer did not take pictures within {_FLUSH_S:.0f} s")

@@ -75,6 +75,9 @@ def test_P5_observers_cameras_states_and_pictures_are_drawn(tmp_path: Path) -> N
     assert len(values_of(entities[ROBOT], "Transform3D:translation")) == 4
     assert len(values_of(entities[f"{ROBOT}/cam0"], "Pinhole:image_from_camera")) == 1
     assert len(values_of(entities[f"{ROBOT}/cam0"], "EncodedImage:blob")) == 4
+    seen = values_of(entities[f"{ROBOT}/cam0/landmarks"], "Points2D:positions")
+    lines = values_of(entities[f"{ROBOT}/cam0/residuals"], "LineStrips2D:strips")
+    assert [len(points) for points in seen] == [len(each) for each in lines]
     assert len(values_of(entities[f"/states/{MISSION[:8]}/velocity_mps"], "Scalars:scalars")) == 4
 
 
