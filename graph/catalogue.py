@@ -24,10 +24,15 @@ OperatorType = type[Operator[Any, Any]]
 
 BUILT_IN = {
     "absolute_poses": "mapstream.operators.absolute.poses:AbsolutePoses",
+    "clahe": "mapstream.operators.images.clahe:Clahe",
     "cloud_sink": "mapstream.operators.sinks.cloud:CloudSink",
+    "depth_registration": "mapstream.operators.images.depth_registration:DepthRegistration",
+    "eight_bits": "mapstream.operators.images.eight_bits:EightBits",
     "external_loops": "mapstream.operators.submaps.external_loops:ExternalLoops",
+    "features": "mapstream.operators.features.features:Features",
     "gicp_odometry": "mapstream.operators.odometry.gicp_odometry:GicpOdometry",
     "gnss": "mapstream.operators.gnss.positions:Gnss",
+    "gray": "mapstream.operators.images.gray:Gray",
     "image_decode": "mapstream.operators.decode.image:ImageDecode",
     "imu_biases": "mapstream.operators.imu.biases:ImuBiases",
     "keyframes": "mapstream.operators.submaps.keyframes:Keyframes",
@@ -43,10 +48,14 @@ BUILT_IN = {
     "odometry_file": "mapstream.operators.sources.odometry_file:OdometryFile",
     "odometry_guard": "mapstream.operators.odometry.odometry_guard:OdometryGuard",
     "optimizer": "mapstream.operators.backend.optimizer:Optimizer",
-    "orb": "mapstream.operators.tracking.orb:Orb",
+    "orb": "mapstream.operators.features.features:Orb",
+    "rectify": "mapstream.operators.images.rectify:Rectify",
+    "resize": "mapstream.operators.images.resize:Resize",
     "submap_builder": "mapstream.operators.submaps.submap_builder:SubmapBuilder",
     "trajectory": "mapstream.operators.trajectory.trajectory:Trajectory",
     "trajectory_sink": "mapstream.operators.sinks.trajectory:TrajectorySink",
+    "undistort": "mapstream.operators.images.undistort:Undistort",
+    "visual_inertial_odometry": "mapstream.operators.odometry.visual_inertial.visual_inertial_odometry:VisualInertialOdometry",
 }
 
 

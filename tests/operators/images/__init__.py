@@ -1,0 +1,1 @@
+"""Images before anything is found in them."""
