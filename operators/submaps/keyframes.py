@@ -81,9 +81,9 @@ class Keyframes(Operator[Inputs, Outputs]):
             keyframe = self.moment(odometry, cloud, n_frame)
             waiting = keyframe
             pose = (odometry.stamp_ns, odometry.T_odom_base)
-            if self._trigger.is_due(*pose) or self._overlap.is_lost(n_frame):
+            if self._trigger.is_due(*pose) or self._overlap.is_lost(keyframe.features):
                 self._trigger.restart(*pose)
-                self._overlap.restart(n_frame)
+                self._overlap.restart(keyframe.features)
                 self._covariance, self._was_lost = np.zeros((6, 6)), False
                 waiting = None
                 await outputs.keyframes.send(keyframe)

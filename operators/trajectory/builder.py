@@ -13,9 +13,11 @@ from collections import Counter
 import numpy as np
 
 from mapstream.operators.odometry.continuous import Motion
+from mapstream.operators.submaps.overlap import Tracks, tracks_of
 from mapstream.operators.submaps.records import records_of
 from mapstream.operators.trajectory.dead_reckoning import LEVELLING_NS, DeadReckoning
 from mapstream.operators.trajectory.links import Links
+from mapstream.operators.trajectory.weak_links import ALWAYS, without_superfluous
 from mapstream.operators.trajectory.window import CommitWindow, Seen, View
 from mapstream.streams.errors import EstimationError
 from mapstream.streams.join import END
@@ -44,6 +46,7 @@ class TrajectoryBuilder:
         links: Links,
         *,
         window_ns: int | None = 0,
+        num_common_tracks: int = ALWAYS,
         keep_ns: int = 30_000_000_000,
     ) -> None:
         """Make a trajectory.
@@ -51,6 +54,7 @@ class TrajectoryBuilder:
         Args:
             links: The sources of motion; whoever feeds them keeps them longer than `keep_ns`.
             window_ns: How late measurements are waited for; None: all is held until the end.
+            num_common_tracks: Below that many, odometry joins two poses; see `weak_links`.
             keep_ns: How late a measurement may split a stretch that went out.
         """
         self.sensors = "{}"  # JSON: the sensor set with its calibration
@@ -58,6 +62,8 @@ class TrajectoryBuilder:
         self._links = links
         self._window = CommitWindow(window_ns)
         self._keep_ns = keep_ns
+        self._num_common_tracks = num_common_tracks
+        self._tracks: Tracks = frozenset()  # that the newest pose sees
         self._late: dict[int, list[Constraint]] = {}  # by stamp, not newer than the newest pose
         self._out: list[int] = []  # stamps of poses that went out, of the last while
         self._num_submaps = 0
@@ -117,8 +123,10 @@ class TrajectoryBuilder:
             if self._links.is_outside(stamp_ns):
                 self.lost["measurements before or after all that is known of motion"] += 1
                 continue
-            edges += self._reach(stamp_ns)
+            reaching = self._reach(stamp_ns)
             keyframes.append(self._keyframe(stamp_ns, view))
+            before, self._tracks = self._tracks, tracks_of(keyframes[-1].features)
+            edges += without_superfluous(reaching, before, self._tracks, self._num_common_tracks)
             constraints += measured
         if len(keyframes) == len(repeated) and not splices and not late:
             return None

@@ -116,6 +116,8 @@ class TrajectoryConfig(OperatorConfig):
     """An input `clouds`: poses are made where clouds are, and keep them."""
     n_frames: bool = False
     """An input `n_frames`: poses are made where features of cameras are, and keep them."""
+    num_common_tracks: int = Field(default=0, ge=-1)
+    """Odometry joins two poses only if they see fewer tracks in common; 0: always, -1: never. The IMU always does."""
     bridge: Literal["none", "still", "constant_velocity"] = "still"
     """What links poses between which nothing was measured; `none` makes that an error."""
     period_s: PositiveFloat | None = 1.0

@@ -226,5 +226,6 @@ class Trajectory(DynamicPorts, Operator[Ports, Outputs]):
             self._builder = TrajectoryBuilder(
                 Links(name, self._sources, self._imu, bridge_of(self._config, self._sources)),
                 window_ns=None if window_s is None else round(window_s * _SECOND_NS),
+                num_common_tracks=self._config.num_common_tracks,
                 keep_ns=round(self._config.late_s * _SECOND_NS),
             )

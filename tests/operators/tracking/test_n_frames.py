@@ -18,7 +18,7 @@ from mapstream.operators.trajectory.trajectory import Trajectory
 from mapstream.recordings.maps import Map, check_map
 from mapstream.recordings.maps.submaps import append_submap
 from mapstream.streams.messages.vision import ImageFeatures, NFrame
-from tests.operators.trajectory.drives import odometry
+from tests.operators.trajectory.drives import imu, odometry
 
 pytestmark = pytest.mark.anyio
 
@@ -142,3 +142,46 @@ async def test_G7_a_keyframe_is_kept_when_too_few_tracks_are_left() -> None:
 
     kept = [stamps_ns.index(k.stamp_ns) for k in sent["keyframes"]]
     assert kept == [0, 4, 8, 10]  # with 6 of 10 tracks left; the last moment always
+
+
+@pytest.mark.parametrize(("num_common", "expected"), [(0, 9), (-1, 0), (6, 0), (8, 9), (7, 3)])
+async def test_C14_odometry_joins_poses_that_see_little_in_common(
+    num_common: int, expected: int
+) -> None:
+    """Ten poses; six tracks are common to any two that follow, seven to six of the pairs."""
+    stamps_ns = [i * PERIOD_NS for i in range(1, 11)]
+    config = TrajectoryConfig.model_validate(
+        {
+            "sources": {"odometry": {"kind": "odometry"}},
+            "imu": {},
+            "n_frames": True,
+            "period_s": 0.05,
+            "num_common_tracks": num_common,
+        }
+    )
+    first = [0, 3, 6, 9, 12, 15, 18, 22, 26, 30]  # of ten tracks in a row
+
+    def seen(number: int) -> NFrame:
+        features_ = ImageFeatures(
+            stamp_ns=stamps_ns[number],
+            kind="klt",
+            frame="left",
+            keypoints_px=np.zeros((10, 2), np.float32),
+            track_ids=np.arange(10) + first[number],
+        )
+        return NFrame(stamp_ns=stamps_ns[number], features=(features_,))
+
+    sent = await run_operator(
+        Trajectory(config),
+        config=config,
+        odometry=[odometry(s * MS) for s in range(0, 700, 20)],
+        imu=[imu(s * MS) for s in range(40, 720, 50)],
+        n_frames=[seen(number) for number in range(10)],
+    )
+    map_ = Map.empty()
+    for submap in sent["submaps"]:
+        map_ = append_submap(map_, submap)
+
+    assert check_map(map_) == []
+    assert map_.edges.kind.tolist().count("imu") == 9
+    assert map_.edges.kind.tolist().count("odometry") == expected
