@@ -31,7 +31,7 @@ from mapstream.graph.load import load_graph
 from mapstream.graph.plan import plan
 from mapstream.graph.run import run_graph
 from mapstream.operators.decode.image import ImageDecode, ImageDecodeConfig
-from mapstream.operators.tracking.orb import Orb, OrbConfig
+from mapstream.operators.features.features import Orb, OrbConfig
 from mapstream.recordings.decoding import decoder_for
 from mapstream.recordings.mcap_writer import McapWriter
 from mapstream.recordings.recording import RawMessage, open_recording

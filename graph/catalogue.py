@@ -30,6 +30,7 @@ BUILT_IN = {
     "eight_bits": "mapstream.operators.images.eight_bits:EightBits",
     "external_loops": "mapstream.operators.submaps.external_loops:ExternalLoops",
     "features": "mapstream.operators.features.features:Features",
+    "feature_tracker": "mapstream.operators.tracking.feature_tracker:FeatureTracker",
     "gicp_odometry": "mapstream.operators.odometry.gicp_odometry:GicpOdometry",
     "gnss": "mapstream.operators.gnss.positions:Gnss",
     "gray": "mapstream.operators.images.gray:Gray",

@@ -8,7 +8,6 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from mapstream.operators.operator import report_loss
 from mapstream.streams.messages.sensors import CameraFrame
 
 GrayImage = npt.NDArray[np.uint8]
@@ -26,17 +25,23 @@ def gray(frame: CameraFrame) -> GrayImage:
     return np.ascontiguousarray(image, np.uint8)
 
 
-def has_calibrated_size(frame: CameraFrame) -> bool:
-    """Return whether an image is as large as its calibration says; count it as lost if not.
+def wrong_size(frame: CameraFrame) -> str | None:
+    """Return what to report of an image that is not as large as its calibration says; None if it is.
 
     Keypoints of another size would be rays in wrong directions.
     """
     camera = frame.camera
     height, width = frame.image.shape[:2]
     if camera is None or (width, height) == (camera.width_px, camera.height_px):
-        return True
-    report_loss(
+        return None
+    return (
         f"images of {frame.frame} with {width} x {height} px, though it is calibrated for "
         f"{camera.width_px} x {camera.height_px} px; resize them, or correct the calibration"
     )
-    return False
+
+
+def unlike(left: CameraFrame, right: CameraFrame) -> str | None:
+    """Return what to report of a pair of images of two sizes; None if they have one."""
+    if left.image.shape[:2] == right.image.shape[:2]:
+        return None
+    return f"images of {right.frame} that are not as large as those of {left.frame}"

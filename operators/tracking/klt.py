@@ -7,7 +7,7 @@ from typing import ClassVar
 
 import cv2
 
-from mapstream.operators.features.gray import has_calibrated_size
+from mapstream.operators.features.gray import unlike, wrong_size
 from mapstream.operators.operator import Operator, Placement, offload, report_loss, warn
 from mapstream.operators.tracking.klt_tracker import KltConfig, KltTracker
 from mapstream.operators.tracking.turning import GyroTurns
@@ -63,7 +63,9 @@ class Klt(Operator[Inputs, Outputs]):
             interval=turns.interval,
         ):
             turn = turns.turn(frame, batches)
-            if not has_calibrated_size(frame):
+            reason = wrong_size(frame)
+            if reason is not None:
+                report_loss(reason)
                 outputs.features.advance(frame.stamp_ns)
                 continue
             await outputs.features.send(await offload(tracker.track, frame, turn, detections))
@@ -71,9 +73,9 @@ class Klt(Operator[Inputs, Outputs]):
                 continue
             if right is None:
                 warn(f"images of {frame.frame} without one of the right camera")
-            elif right.image.shape[:2] != frame.image.shape[:2]:
-                report_loss(
-                    f"images of {right.frame} that are not as large as those of {frame.frame}"
-                )
-            elif has_calibrated_size(right):
+                continue
+            reason = wrong_size(right) or unlike(frame, right)
+            if reason is None:
                 await outputs.right_features.send(await offload(tracker.track_right, frame, right))
+            else:
+                report_loss(reason)

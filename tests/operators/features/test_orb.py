@@ -4,15 +4,15 @@ import cv2
 import numpy as np
 import pytest
 
+from mapstream.operators.features.features import Orb, OrbConfig
 from mapstream.operators.operator import Context
 from mapstream.operators.testing import run_operator
-from mapstream.operators.tracking.orb import Orb, OrbConfig
 from mapstream.streams.messages.sensors import CameraFrame
 
 pytestmark = pytest.mark.anyio
 _NOISE = cv2.resize(
     np.random.default_rng(3).integers(0, 255, (60, 80), np.uint8), (320, 240),
-    interpolation=cv2.INTER_NEAREST,
+    interpolation=cv2.INTER_CUBIC,
 )  # fmt: skip
 
 
