@@ -56,7 +56,7 @@ class DepthRegistration(Operator[Inputs, Outputs]):
 
     def __init__(self, config: DepthRegistrationConfig) -> None:
         self._config = config
-        self._rays: dict[tuple[object, ...], FloatArray] = {}
+        self._rays: dict[tuple[object, ...], Float32Array] = {}
 
     async def run(self, inputs: Inputs, outputs: Outputs) -> None:
         within_ns = round(self._config.tolerance_s * 1e9)
@@ -75,11 +75,10 @@ class DepthRegistration(Operator[Inputs, Outputs]):
         old, new = require_camera(depth), require_camera(frame)
         config = self._config
         depth_m = depth_m_of(depth, least_m=config.least_depth_m, most_m=config.most_depth_m)
-        is_seen = np.isfinite(depth_m).ravel()
-        points_old = self._rays_of(old)[is_seen] * depth_m.ravel()[is_seen, None]
         T_new_old = frame.T_base_sensor.inverse() @ depth.T_base_sensor
-        points_new = points_old @ T_new_old.R.T + T_new_old.t
-        moved_m = _drawn(points_new, new, _width_px(old, new))
+        rays = self._rays_of(old, T_new_old.R)
+        points = rays * depth_m.ravel() + T_new_old.t.astype(np.float32)[:, None]
+        moved_m = _drawn(points, new, _width_px(old, new))
         is_mm = depth.encoding == "16UC1"
         return replace(
             depth,
@@ -92,13 +91,13 @@ class DepthRegistration(Operator[Inputs, Outputs]):
             record=None,  # what lies there is not registered
         )
 
-    def _rays_of(self, camera: CameraCalibration) -> FloatArray:
-        """Return the points of depth 1 m (H * W, 3) of all pixels; NaN where none is seen."""
-        key = calibration_key(camera)
+    def _rays_of(self, camera: CameraCalibration, R_new_old: FloatArray) -> Float32Array:
+        """Return the points of depth 1 m (3, H * W) of all pixels, turned; NaN where none is seen."""
+        key = (*calibration_key(camera), R_new_old.tobytes())
         if key not in self._rays:
             x, y = np.meshgrid(np.arange(camera.width_px), np.arange(camera.height_px))
             rays = unproject(camera, np.stack([x.ravel(), y.ravel()], axis=1).astype(np.float64))
-            self._rays[key] = rays / rays[:, 2:]
+            self._rays[key] = (R_new_old @ (rays / rays[:, 2:]).T).astype(np.float32)
         return self._rays[key]
 
 
@@ -107,15 +106,27 @@ def _width_px(old: CameraCalibration, new: CameraCalibration) -> int:
     return int(np.ceil(float((new.focal_px / old.focal_px).max()) - 1e-9))
 
 
-def _drawn(points: FloatArray, camera: CameraCalibration, width_px: int) -> Float32Array:
-    """Return the depth image (H, W) of points (N, 3) in the camera's frame; NaN where there is none."""
-    px, is_seen = project(camera, points)
-    corners = np.round(px[is_seen] - (width_px - 1) / 2).astype(np.int64)
-    depth_m = points[is_seen, 2].astype(np.float32)
-    image = np.full((camera.height_px, camera.width_px), np.inf, np.float32)
+def _drawn(points: Float32Array, camera: CameraCalibration, width_px: int) -> Float32Array:
+    """Return the depth image (H, W) of points (3, N) in the camera's frame; NaN where there is none."""
+    left, top = np.floor(_pixels(points, camera) - np.float32(width_px / 2 - 1))
+    image = np.full(camera.height_px * camera.width_px, np.inf, np.float32)
     for dy in range(width_px):
         for dx in range(width_px):
-            x, y = corners[:, 0] + dx, corners[:, 1] + dy
-            inside = (x >= 0) & (x < camera.width_px) & (y >= 0) & (y < camera.height_px)
-            np.minimum.at(image, (y[inside], x[inside]), depth_m[inside])
-    return np.where(np.isfinite(image), image, np.float32(np.nan))
+            with np.errstate(invalid="ignore"):  # what is not seen is nowhere
+                inside = (left >= -dx) & (left < camera.width_px - dx)
+                inside &= (top >= -dy) & (top < camera.height_px - dy)
+            x, y = left[inside].astype(np.int64) + dx, top[inside].astype(np.int64) + dy
+            np.minimum.at(image, y * camera.width_px + x, points[2, inside])
+    image[np.isinf(image)] = np.nan
+    return image.reshape(camera.height_px, camera.width_px)
+
+
+def _pixels(points: Float32Array, camera: CameraCalibration) -> Float32Array:
+    """Return the pixels (2, N) of points (3, N); NaN where there is none."""
+    if (camera.model, camera.distortion) != ("pinhole", "none"):
+        return project(camera, points.T.astype(np.float64))[0].T.astype(np.float32)
+    scale = camera.focal_px.astype(np.float32)[:, None]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        depth_m: Float32Array = np.where(points[2] > 0, points[2], np.float32(np.nan))
+        px = (points[:2] / depth_m * scale).astype(np.float32, copy=False)
+    return px + camera.center_px.astype(np.float32)[:, None]
