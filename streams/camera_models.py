@@ -17,7 +17,7 @@ import numpy as np
 
 from mapstream.streams.arrays import FloatArray
 from mapstream.streams.calibration import CameraCalibration
-from mapstream.streams.distortion import BoolArray, distort, undistort
+from mapstream.streams.distortion import BoolArray, distort, distortion_by_parameters, undistort
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -77,8 +77,11 @@ def projection_jacobians(
     by_point: FloatArray = by_plane @ _plane_by_point(camera, points, plane)
     by_focal = bent.points[:, :, None] * np.eye(2)
     by_center = np.where(np.isfinite(by_focal), np.eye(2), np.nan)
-    by_parameter = camera.focal_px[:, None] * bent.by_parameter
-    columns = [by_focal, by_center, by_parameter]
+    by_lens = distortion_by_parameters(
+        camera.distortion, camera.distortion_parameters, plane.points
+    )
+    by_lens[np.isnan(bent.points[:, 0])] = np.nan
+    columns = [by_focal, by_center, camera.focal_px[:, None] * by_lens]
     if camera.xi is not None:
         plane_by_xi = -plane.points * (plane.distances / plane.depths)[:, None]
         columns.insert(2, by_plane @ plane_by_xi[:, :, None])

@@ -32,42 +32,47 @@ _TANGENTIAL = slice(2, 4)  # p1, p2 among the parameters of radtan and rational_
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Distorted:
-    """Points of the normalised plane behind the lens, and how they move."""
+    """Points of the normalised plane behind the lens, and how they move with those before it."""
 
     points: FloatArray  # (N, 2); NaN where the lens is not valid
     by_point: FloatArray  # (N, 2, 2)
-    by_parameter: FloatArray  # (N, 2, P) in the order of `Distortion`
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Radius:
-    value: FloatArray  # (N,) f
-    slope: FloatArray  # (N,) f'
-    by_parameter: FloatArray  # (N, P)
 
 
 def distort(kind: Distortion, parameters: FloatArray, points: FloatArray) -> Distorted:
     """Bend points (N, 2) of the normalised plane as a lens does."""
     r = np.hypot(points[:, 0], points[:, 1])
     with np.errstate(all="ignore"):  # what is beyond the limit may overflow, and becomes NaN below
-        radius = _RADII[kind](r, parameters)
-        n = np.where(r[:, None] > 0, points / r[:, None], 0.0)
-        scale = np.where(r > 0, radius.value / r, radius.slope)
-        radial = (radius.slope - scale)[:, None, None] * (n[:, :, None] * n[:, None, :])
-        by_point = scale[:, None, None] * np.eye(2) + radial
-        by_parameter = n[:, :, None] * radius.by_parameter[:, None, :]
+        value, slope = _RADII[kind](r, parameters)
+        scale = np.where(r > 0, value / r, slope)
+        n = _directions(points, r)
+        by_point = (slope - scale)[:, None, None] * (n[:, :, None] * n[:, None, :])
+        by_point[:, [0, 1], [0, 1]] += scale[:, None]
         bent = scale[:, None] * points
         if _has_tangential(kind):
             p = parameters[_TANGENTIAL]
-            shifts, by_shifted = _tangential(points, p)
-            bent, by_point = bent + shifts @ p, by_point + by_shifted
-            by_parameter[:, :, _TANGENTIAL] = shifts
+            bent += _tangential(points) @ p
+            by_point += _tangential_by_point(points, p)
         valid = (r < limit_radius(kind, parameters)) & (_determinants(by_point) > 0)
-    return Distorted(
-        points=np.where(valid[:, None], bent, np.nan),
-        by_point=np.where(valid[:, None, None], by_point, np.nan),
-        by_parameter=np.where(valid[:, None, None], by_parameter, np.nan),
-    )
+    bent[~valid], by_point[~valid] = np.nan, np.nan
+    return Distorted(bent, by_point)
+
+
+def distortion_by_parameters(
+    kind: Distortion, parameters: FloatArray, points: FloatArray
+) -> FloatArray:
+    """Return how bent points move with the lens' parameters (N, 2, P); rows of invalid points mean nothing."""
+    r = np.hypot(points[:, 0], points[:, 1])
+    with np.errstate(all="ignore"):
+        radius_by_parameter = _RADII_BY_PARAMETER[kind](r, parameters)
+        jacobian = _directions(points, r)[:, :, None] * radius_by_parameter[:, None, :]
+        if _has_tangential(kind):
+            jacobian[:, :, _TANGENTIAL] = _tangential(points)
+    return jacobian
+
+
+def _directions(points: FloatArray, r: FloatArray) -> FloatArray:
+    n: FloatArray = points / np.where(r > 0, r, 1.0)[:, None]
+    return n
 
 
 def undistort(kind: Distortion, parameters: FloatArray, points: FloatArray) -> FloatArray:
@@ -122,17 +127,17 @@ def _undistorted_radius(
     with np.errstate(all="ignore"):  # at the limit the slope may vanish; then the brackets help
         for _ in range(_MAX_STEPS):
             r = np.tan(angle)
-            radius = _RADII[kind](r, parameters)
-            miss = radius.value - targets
+            value, slope = _RADII[kind](r, parameters)
+            miss = value - targets
             low, high = np.where(miss < 0, angle, low), np.where(miss < 0, high, angle)
-            newton = angle - miss / (radius.slope * (1 + r * r))
+            newton = angle - miss / (slope * (1 + r * r))
             inside = (newton > low) & (newton < high)
             step = np.where(inside, newton, (low + high) / 2) - angle
             settled = ~(np.abs(miss) > tolerance) | (np.abs(step) < 1e-16)
             if settled.all():
                 break
             angle = np.where(settled, angle, angle + step)
-        solved = np.abs(_RADII[kind](np.tan(angle), parameters).value - targets) < _CONVERGED
+        solved = np.abs(_RADII[kind](np.tan(angle), parameters)[0] - targets) < _CONVERGED
     return np.where(solved, np.tan(angle), np.nan)
 
 
@@ -167,18 +172,31 @@ def _has_tangential(kind: Distortion) -> bool:
     return kind in ("radtan", "rational_polynomial")
 
 
-def _tangential(points: FloatArray, p: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the shifts (N, 2, 2) by p1 and p2, and the derivative (N, 2, 2) of their sum by the point."""
+def _tangential(points: FloatArray) -> FloatArray:
+    """Return the shifts (N, 2, 2) by p1 and p2."""
     u, v = points.T
-    both, square = 2 * u * v, u * u + v * v
-    rows = [[both, square + 2 * u * u], [square + 2 * v * v, both]]
-    mixed = 2 * (p[0] * u + p[1] * v)
-    by_point = [[2 * p[0] * v + 6 * p[1] * u, mixed], [mixed, 6 * p[0] * v + 2 * p[1] * u]]
-    return np.moveaxis(np.array(rows), -1, 0), np.moveaxis(np.array(by_point), -1, 0)
+    shifts = np.empty((len(points), 2, 2))
+    shifts[:, 0, 0] = shifts[:, 1, 1] = 2 * u * v
+    shifts[:, 0, 1] = 3 * u * u + v * v
+    shifts[:, 1, 0] = u * u + 3 * v * v
+    return shifts
 
 
-def _straight(r: FloatArray, _: FloatArray) -> _Radius:
-    return _Radius(r, np.ones_like(r), np.empty((len(r), 0)))
+def _tangential_by_point(points: FloatArray, p: FloatArray) -> FloatArray:
+    u, v = points.T
+    jacobian = np.empty((len(points), 2, 2))
+    jacobian[:, 0, 0] = 2 * p[0] * v + 6 * p[1] * u
+    jacobian[:, 0, 1] = jacobian[:, 1, 0] = 2 * (p[0] * u + p[1] * v)
+    jacobian[:, 1, 1] = 6 * p[0] * v + 2 * p[1] * u
+    return jacobian
+
+
+def _straight(r: FloatArray, _: FloatArray) -> tuple[FloatArray, FloatArray]:
+    return r, np.ones_like(r)
+
+
+def _straight_by_parameters(r: FloatArray, _: FloatArray) -> FloatArray:
+    return np.empty((len(r), 0))
 
 
 def _fraction(parameters: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -187,44 +205,76 @@ def _fraction(parameters: FloatArray) -> tuple[FloatArray, FloatArray]:
     return np.array([1, k[0], k[1], k[4]]), np.array([1, k[5], k[6], k[7]])
 
 
-def _rational(r: FloatArray, parameters: FloatArray) -> _Radius:
+def _polynomial(coefficients: FloatArray, s: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return a polynomial's values and slopes (N,), by Horner's rule."""
+    value, slope = np.zeros_like(s), np.zeros_like(s)
+    for coefficient in coefficients[::-1].tolist():
+        slope = slope * s + value
+        value = value * s + coefficient
+    return value, slope
+
+
+def _rational(r: FloatArray, parameters: FloatArray) -> tuple[FloatArray, FloatArray]:
     s = r * r
-    powers = np.stack([np.ones_like(s), s, s * s, s**3], axis=1)
-    slopes = np.stack([np.zeros_like(s), np.ones_like(s), 2 * s, 3 * s * s], axis=1)
     above, below = _fraction(parameters)
-    A, B = powers @ above, powers @ below
-    slope = A / B + 2 * s * ((slopes @ above) * B - A * (slopes @ below)) / B**2
+    A, A_by_s = _polynomial(above, s)
+    if len(parameters) < 8:
+        return r * A, A + 2 * s * A_by_s
+    B, B_by_s = _polynomial(below, s)
+    return r * A / B, A / B + 2 * s * (A_by_s * B - A * B_by_s) / B**2
+
+
+def _rational_by_parameters(r: FloatArray, parameters: FloatArray) -> FloatArray:
+    s = r * r
+    powers = np.stack([s, s * s, s * s * s], axis=1)
+    (A, _), (B, _) = (_polynomial(part, s) for part in _fraction(parameters))
     by_above, by_below = powers * (r / B)[:, None], -powers * (r * A / B**2)[:, None]
-    none = np.zeros_like(r)
-    columns = [*by_above[:, 1:3].T, none, none, by_above[:, 3], *by_below[:, 1:].T]
-    return _Radius(r * A / B, slope, np.stack(columns[: len(parameters)], axis=1))
+    tangential = np.zeros((len(r), 2))
+    columns = [by_above[:, :2], tangential, by_above[:, 2:], by_below]
+    jacobian: FloatArray = np.concatenate(columns, axis=1)[:, : len(parameters)]
+    return jacobian
 
 
-def _equidistant(r: FloatArray, parameters: FloatArray) -> _Radius:
+def _equidistant(r: FloatArray, parameters: FloatArray) -> tuple[FloatArray, FloatArray]:
     angle = np.arctan(r)
-    powers = angle[:, None] ** np.array([1, 3, 5, 7, 9])
-    slope = (angle[:, None] ** np.array([0, 2, 4, 6, 8])) @ (
-        np.array([1, 3, 5, 7, 9]) * np.array([1, *parameters])
-    )
-    return _Radius(powers @ np.array([1, *parameters]), slope / (1 + r * r), powers[:, 1:])
+    value, slope = _polynomial(np.array([1, *parameters]), angle * angle)
+    return angle * value, (value + 2 * angle * angle * slope) / (1 + r * r)
 
 
-def _fov(r: FloatArray, parameters: FloatArray) -> _Radius:
+def _equidistant_by_parameters(r: FloatArray, _: FloatArray) -> FloatArray:
+    angle = np.arctan(r)
+    s = angle * angle
+    return np.stack([angle * s, angle * s**2, angle * s**3, angle * s**4], axis=1)
+
+
+def _fov(r: FloatArray, parameters: FloatArray) -> tuple[FloatArray, FloatArray]:
     w = abs(float(parameters[0]))
-    if w < _SMALL_FOV:
-        bend = r / 12 - r**3 / 3  # the series of f around w = 0
-        slope = 1 + w * w * (1 / 12 - r * r)
-        return _Radius(r + w * w * bend, slope, (2 * parameters[0] * bend)[:, None])
+    if w < _SMALL_FOV:  # the series around w = 0
+        return r + w * w * (r / 12 - r**3 / 3), 1 + w * w * (1 / 12 - r * r)
     t = 2 * np.tan(w / 2)
-    value, square = np.arctan(r * t) / w, 1 + (r * t) ** 2
-    by_w = r / np.cos(w / 2) ** 2 / square / w - value / w
-    return _Radius(value, t / square / w, np.sign(parameters[0]) * by_w[:, None])
+    return np.arctan(r * t) / w, t / (1 + (r * t) ** 2) / w
 
 
-_RADII: dict[Distortion, Callable[[FloatArray, FloatArray], _Radius]] = {
+def _fov_by_parameters(r: FloatArray, parameters: FloatArray) -> FloatArray:
+    w = float(parameters[0])
+    if abs(w) < _SMALL_FOV:
+        return (2 * w * (r / 12 - r**3 / 3))[:, None]
+    t = 2 * np.tan(w / 2)
+    jacobian: FloatArray = r / np.cos(w / 2) ** 2 / (1 + (r * t) ** 2) / w - np.arctan(r * t) / w**2
+    return jacobian[:, None]
+
+
+_RADII: dict[Distortion, Callable[[FloatArray, FloatArray], tuple[FloatArray, FloatArray]]] = {
     "none": _straight,
     "radtan": _rational,
     "equidistant": _equidistant,
     "fov": _fov,
     "rational_polynomial": _rational,
+}
+_RADII_BY_PARAMETER: dict[Distortion, Callable[[FloatArray, FloatArray], FloatArray]] = {
+    "none": _straight_by_parameters,
+    "radtan": _rational_by_parameters,
+    "equidistant": _equidistant_by_parameters,
+    "fov": _fov_by_parameters,
+    "rational_polynomial": _rational_by_parameters,
 }

@@ -73,8 +73,8 @@ class Lens:
         drawn = self._renderer.image(band.pinhole, T_world_camera)
         if not band.look_up.size:
             return drawn
-        bent: Picture = cv2.remap(drawn, band.look_up[0], band.look_up[1], cv2.INTER_LINEAR)
-        return bent
+        bent = cv2.remap(drawn, band.look_up[0], band.look_up[1], cv2.INTER_LINEAR)
+        return bent.astype(np.uint8, copy=False)
 
 
 def _is_pinhole(camera: CameraCalibration) -> bool:

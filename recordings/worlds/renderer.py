@@ -56,16 +56,13 @@ class Renderer:
         self.surfaces = tuple(surfaces)
         self._levels = [pyramid(surface.picture) for surface in self.surfaces]
         tiles = [tile for row, surface in enumerate(self.surfaces) for tile in _tiles(row, surface)]
-        tiles.sort(
-            key=lambda tile: not self.surfaces[tile.surface].is_shell
-        )  # the shell comes first
-        self._tiles = tiles
-        owners = [self.surfaces[tile.surface] for tile in tiles]
-        self._corners = np.stack([tile.corners for tile in tiles])  # (N, 4, 3) [m]
+        self._tiles = sorted(tiles, key=lambda tile: not self._is_shell(tile))  # the shell first
+        owners = [self.surfaces[tile.surface] for tile in self._tiles]
+        self._corners = np.stack([tile.corners for tile in self._tiles])  # (N, 4, 3) [m]
         self._origins = np.stack([owner.origin for owner in owners])
         self._axes = np.stack([[owner.right, owner.down] for owner in owners])  # (N, 2, 3)
         self._normals = np.stack([owner.normal for owner in owners])
-        self._texels_m = np.array([tile.texel_m for tile in tiles])
+        self._texels_m = np.array([tile.texel_m for tile in self._tiles])
 
     def image(self, camera: Pinhole, T_world_camera: FloatArray) -> Picture:
         """Return what is seen from a pose (4, 4); black where nothing is."""
@@ -73,7 +70,7 @@ class Renderer:
         depths = np.zeros(image.shape[:2], np.float32)
         for patch in self._patches(camera, T_world_camera):
             mask = patch.mask()
-            if not self.surfaces[patch.tile.surface].is_shell:  # nothing was drawn before the shell
+            if not self._is_shell(patch.tile):  # nothing was drawn before the shell
                 patch.test_depth(mask, depths)
             patch.draw(mask, self._levels[patch.tile.surface], image)
         return image
@@ -89,6 +86,9 @@ class Renderer:
             patch.draw(mask, self._levels[patch.tile.surface], image)
             patch.part(surfaces)[mask] = patch.tile.surface
         return Rendering(image, depths, surfaces)
+
+    def _is_shell(self, tile: _Tile) -> bool:
+        return self.surfaces[tile.surface].is_shell
 
     def _blank(self, camera: Pinhole) -> Picture:
         width, height = camera.size_px
@@ -181,26 +181,23 @@ class _Patch:
         view: A = image[self.low[1] : self.high[1], self.low[0] : self.high[0]]
         return view
 
-    def _linear(self, coefficients: FloatArray) -> Float32Array:
-        """Return a x + b y + c for the patch's pixels."""
-        a, b, c = coefficients
-        x = np.arange(self.low[0], self.high[0])
-        y = np.arange(self.low[1], self.high[1])
-        linear: Float32Array = (a * x).astype(np.float32) + (b * y + c).astype(np.float32)[:, None]
-        return linear
+    def _linear(self, lines: FloatArray) -> tuple[Float32Array, Float32Array]:
+        """Return a x (E, 1, W) and b y + c (E, H, 1) of lines (E, 3) for the patch's pixels."""
+        (x0, y0), (x1, y1) = self.low.tolist(), self.high.tolist()
+        across = np.multiply.outer(lines[:, 0], np.arange(x0, x1)).astype(np.float32)
+        along = np.multiply.outer(lines[:, 1], np.arange(y0, y1)) + lines[:, 2:]
+        return across[:, None], along.astype(np.float32)[:, :, None]
 
     def mask(self) -> BoolArray:
         """Return the pixels whose middle looks at the tile."""
-        x = np.arange(self.low[0], self.high[0])
-        y = np.arange(self.low[1], self.high[1])[:, None]
-        mask = np.ones((len(y), len(x)), np.bool_)
-        for a, b, c in self.tile.edges @ self.plane_by_px:
-            mask &= a * x >= -b * y - c
+        across, along = self._linear(self.tile.edges @ self.plane_by_px)
+        mask: BoolArray = np.logical_and.reduce(across >= -along)
         return mask
 
     def test_depth(self, mask: BoolArray, depths: Float32Array) -> None:
         """Take what is hidden from the mask, and write down the inverse depth of the rest."""
-        mine, part = self._linear(self.plane_by_px[2]), self.part(depths)
+        across, along = self._linear(self.plane_by_px[2:])
+        mine, part = (across + along)[0], self.part(depths)
         mask &= mine > part
         cv2.copyTo(mine, mask.view(np.uint8), part)
 
