@@ -7,29 +7,28 @@ infinitely far), to the direction in which the first camera lies (it is infinite
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 
 from mapstream.streams.arrays import FloatArray
 
-BoolArray = npt.NDArray[np.bool_]
 
+def off_arc(start: FloatArray, end: FloatArray, goals: FloatArray, limit_rad: float) -> FloatArray:
+    """Return how far points (T, N) are beside their arcs [rad], for each of T motions; infinite beyond a limit.
 
-def on_arc(start: FloatArray, end: FloatArray, goals: FloatArray, limit_rad: float) -> BoolArray:
-    """Return which points (T, N) are within an angle of their arc, for each of T motions.
-
-    Of an end off its arc three parts are compared: beside it, before its start, and beyond the goal; all times
-    the sine of the arc, which is small where start and goal are close.
+    So they are, too, if they are farther than that before an arc's start or behind its goal.
 
     Args:
         start: (N, 3) unit rays in the first view, turned into the second one.
         end: (N, 3) unit rays in the second view; a row that is not finite is on no arc.
         goals: (T, 3) unit directions from the second camera to the first.
-        limit_rad: Largest angle.
+        limit_rad: Largest angle; small.
     """
     start_goal, end_goal = goals @ start.T, goals @ end.T  # (T, N) cosines
     start_end = (start * end).sum(axis=1)
-    margin = np.sin(limit_rad) * np.sqrt(np.maximum(1 - start_goal**2, 0))
-    fits: BoolArray = np.abs(goals @ np.cross(start, end).T) < margin
+    arc = np.sqrt(np.maximum(1 - start_goal**2, 0))  # its sine, which all parts are multiples of
+    margin = np.sin(limit_rad) * arc
+    beside = np.abs(goals @ np.cross(start, end).T)
+    fits = beside < margin
     fits &= end_goal - start_goal * start_end > -margin
     fits &= start_goal * end_goal - start_end < margin
-    return fits
+    missed: FloatArray = np.where(fits, beside / np.where(arc > 0, arc, 1), np.inf)
+    return missed

@@ -5,16 +5,19 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 from pydantic import PositiveFloat
 
 from mapstream.operators.operator import OperatorConfig
-from mapstream.operators.tracking.epipolar import BoolArray, on_arc
+from mapstream.operators.tracking.epipolar import off_arc
 from mapstream.operators.tracking.rays import rays
 from mapstream.streams.arrays import Float32Array
 from mapstream.streams.calibration import CameraCalibration
 from mapstream.streams.camera_models import project
 from mapstream.streams.geometry import SE3
 from mapstream.streams.messages.sensors import CameraFrame
+
+BoolArray = npt.NDArray[np.bool_]
 
 
 class StereoOptions(OperatorConfig):
@@ -54,5 +57,6 @@ class StereoPair:
         start = rays(self.left, left_px) @ self.T_right_left.R.T
         goal = self.T_right_left.t / np.linalg.norm(self.T_right_left.t)
         limit_rad = max_epipolar_px / float(self.right.focal_px.mean())
-        fits: BoolArray = on_arc(start, rays(self.right, right_px), goal[None], limit_rad)[0]
-        return fits
+        missed = off_arc(start, rays(self.right, right_px), goal[None], limit_rad)[0]
+        agreeing: BoolArray = np.isfinite(missed)
+        return agreeing

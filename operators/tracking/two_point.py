@@ -7,12 +7,14 @@ The two rays of a point, turned into one frame, span a plane in which the transl
 from __future__ import annotations
 
 import numpy as np
+import numpy.typing as npt
 from pydantic import PositiveFloat, PositiveInt
 
 from mapstream.operators.operator import OperatorConfig
-from mapstream.operators.tracking.epipolar import BoolArray, on_arc
+from mapstream.operators.tracking.epipolar import off_arc
 from mapstream.streams.arrays import FloatArray
 
+BoolArray = npt.NDArray[np.bool_]
 _MIN_TRACKS = 6  # with fewer, agreement means nothing
 
 
@@ -61,6 +63,8 @@ def agreeing(
     if len(goals) == 0:  # nothing moved
         return agree
     limit_rad = np.radians(options.max_outlier_angle_deg)
-    fits = on_arc(start[rows], rays_now[rows], goals, limit_rad)
-    agree[rows] = fits[np.argmax(fits.sum(axis=1))]
+    missed = off_arc(start[rows], rays_now[rows], goals, limit_rad)
+    # what many translations fit tells them apart by how well
+    best = np.argmin(np.minimum(missed, limit_rad).sum(axis=1))
+    agree[rows] = np.isfinite(missed[best])
     return agree
