@@ -17,6 +17,8 @@ _ELEMENTS = {
     "tensor(int32)": np.int32,
     "tensor(int64)": np.int64,
 }
+Shapes = dict[str, tuple[int | str | None, ...]]
+"""Of inputs or outputs by name; sizes that are known at run time only are names or None."""
 
 
 class Session:
@@ -51,12 +53,11 @@ class Session:
         except Exception as error:  # onnxruntime has a class of its own per reason
             raise ConfigError(f"{name}: not a network that can be run: {error}") from error
         self.name = name
-        self.inputs = {i.name: tuple(i.shape) for i in self._session.get_inputs()}
-        """Shape of each input; sizes that are known at run time only are names or None."""
+        self.inputs: Shapes = {i.name: tuple(i.shape) for i in self._session.get_inputs()}
         self._dtypes = {
             i.name: np.dtype(_ELEMENTS.get(i.type, np.float32)) for i in self._session.get_inputs()
         }
-        self.outputs = {o.name: tuple(o.shape) for o in self._session.get_outputs()}
+        self.outputs: Shapes = {o.name: tuple(o.shape) for o in self._session.get_outputs()}
 
     def run(self, feeds: Mapping[str, npt.NDArray[Any]]) -> dict[str, npt.NDArray[Any]]:
         """Return all outputs for these inputs, which are converted to the types that the network wants.
