@@ -14,6 +14,13 @@ from mapstream.streams.arrays import FloatArray
 from mapstream.streams.messages.sensors import LidarScan
 
 
+def with_depth_noise(depth_m: FloatArray, times: float, rng: np.random.Generator) -> FloatArray:
+    """Return depths as structured light measures them, with a multiple of the paper's noise."""
+    sigma_m = times * (0.0012 + 0.0019 * (depth_m - 0.4) ** 2)
+    noisy: FloatArray = depth_m + rng.normal(0.0, 1.0, depth_m.shape) * sigma_m
+    return noisy
+
+
 class DepthCameraConfig(BaseModel):
     """A depth camera that measures all its pixels at one time."""
 
@@ -50,9 +57,7 @@ class DepthCamera:
         origins = np.broadcast_to(T_world_camera[:3, 3], directions.shape)
         depth_m = caster.cast(np.ascontiguousarray(origins), directions).ranges_m / lengths
         seen = (depth_m >= config.min_depth_m) & (depth_m <= config.max_depth_m)
-        depth_m = depth_m[seen]
-        sigma_m = config.noise * (0.0012 + 0.0019 * (depth_m - 0.4) ** 2)
-        depth_m += self._rng.normal(0.0, 1.0, len(depth_m)) * sigma_m
+        depth_m = with_depth_noise(depth_m[seen], config.noise, self._rng)
         return LidarScan(
             stamp_ns=stamp_ns, points=depth_m[:, None] * self._rays[seen], frame=self.frame
         )

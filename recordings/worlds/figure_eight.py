@@ -8,21 +8,22 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, PositiveFloat
 
 from mapstream.recordings.worlds.motion import Motion
+from mapstream.recordings.worlds.sway import RAMP_S, REST_S, from_rest, smooth, waves
 from mapstream.streams.arrays import FloatArray
 
 _LENGTH_M, _WIDTH_M = 5.5, 3.0  # half of the eight's
 _HEIGHT_M = 1.5
-_KNOT_NS = 50_000_000
-_MARGIN = 3  # knots beyond both ends
-_REST_S = 2.0
-_RAMP_S = 2.0  # from rest to full speed
 _TURN_RAD = 0.8  # of the phase, for the half turn between two laps
 _SPIN_RADPS = 0.6
-_Waves = tuple[tuple[float, float, float], tuple[float, float, float]]  # slow and fast, three axes
-_SWAY_M: _Waves = ((0.20, 0.15, 0.30), (0.02, 0.02, 0.04))
-_SWAY_HZ: _Waves = ((0.071, 0.083, 0.113), (0.97, 1.13, 0.89))
-_SWAY_RAD: _Waves = ((0.06, 0.07, 0.12), (0.025, 0.025, 0.02))
-_SWAY_RAD_HZ: _Waves = ((0.31, 0.37, 0.23), (1.27, 1.07, 0.83))
+# Slow and fast: amplitudes and rates [Hz] of three axes.
+_SWAY = (
+    ((0.20, 0.15, 0.30), (0.071, 0.083, 0.113)),  # [m]
+    ((0.02, 0.02, 0.04), (0.97, 1.13, 0.89)),
+)
+_SWAY_RPY = (
+    ((0.06, 0.07, 0.12), (0.31, 0.37, 0.23)),  # [rad]
+    ((0.025, 0.025, 0.02), (1.27, 1.07, 0.83)),
+)
 
 
 class FlightConfig(BaseModel):
@@ -50,43 +51,27 @@ def eight(phase_rad: FloatArray) -> FloatArray:
 
 def flight(config: FlightConfig, start_ns: int) -> Motion:
     """Return T_world_base: x is ahead, z upwards."""
-    num_knots = round(config.duration_s * 1e9) // _KNOT_NS + 2
-    stamps_ns = start_ns + np.arange(-_MARGIN, num_knots + _MARGIN) * _KNOT_NS
-    t_s = (stamps_ns - start_ns) / 1e9 + (0.0 if config.start == "rest" else _REST_S + _RAMP_S)
-    ramp = np.clip((t_s - _REST_S) / _RAMP_S, 0, 1)
-    moved_s = _RAMP_S * (ramp**3 - ramp**4 / 2) + np.maximum(0, t_s - _REST_S - _RAMP_S)
-    sway = _smooth(ramp)
+    skip_s = 0.0 if config.start == "rest" else REST_S + RAMP_S
+    start = from_rest(config.duration_s, start_ns, skip_s=skip_s)
+    moved_s, sway = start.moved_s, start.amount[:, None]
     if config.kind == "stand":
-        moved_s, sway = np.zeros_like(t_s), np.zeros_like(t_s)
+        moved_s, sway = np.zeros_like(moved_s), np.zeros_like(sway)
     lap_rad = 2 * np.pi / config.lap_s * moved_s
-    phase = config.phase_rad + (lap_rad if config.kind == "eight" else np.zeros_like(t_s))
+    phase = config.phase_rad + (lap_rad if config.kind == "eight" else np.zeros_like(moved_s))
     heading = _headings(phase)
     if config.kind == "turn":
         heading = heading + _SPIN_RADPS * moved_s
     if config.turn_back:
-        heading = heading + np.pi * _smooth(np.clip((lap_rad - 2 * np.pi) / _TURN_RAD, 0, 1))
-    positions = np.concatenate([eight(phase), np.full((len(t_s), 1), _HEIGHT_M)], axis=1)
+        heading = heading + np.pi * smooth((lap_rad - 2 * np.pi) / _TURN_RAD)
+    positions = np.concatenate([eight(phase), np.full((len(phase), 1), _HEIGHT_M)], axis=1)
     if config.kind == "eight":
-        positions += sway[:, None] * _waves(t_s, _SWAY_M, _SWAY_HZ)
-    rpy_rad = sway[:, None] * _waves(t_s, _SWAY_RAD, _SWAY_RAD_HZ)
+        positions += sway * sum(waves(start.t_s, *wave) for wave in _SWAY)
+    rpy_rad = sway * sum(waves(start.t_s, *wave) for wave in _SWAY_RPY)
     rpy_rad[:, 2] += heading
-    return Motion(stamps_ns, positions, rpy_rad)
-
-
-def _smooth(share: FloatArray) -> FloatArray:
-    """Return a way from 0 to 1 that begins and ends without speed."""
-    way: FloatArray = share * share * (3 - 2 * share)
-    return way
+    return Motion(start.stamps_ns, positions, rpy_rad)
 
 
 def _headings(phase_rad: FloatArray) -> FloatArray:
     """Return the directions (N,) [rad] in which the eight runs."""
     along = _LENGTH_M * np.cos(phase_rad), 2 * _WIDTH_M * np.cos(2 * phase_rad)
     return np.unwrap(np.arctan2(along[1], along[0]))
-
-
-def _waves(t_s: FloatArray, amplitudes: _Waves, rates_hz: _Waves) -> FloatArray:
-    """Return sums of two sine waves (N, 3) whose rates have no common measure: no lap is like another."""
-    turns = 2 * np.pi * t_s[:, None, None] * np.array(rates_hz)
-    waves: FloatArray = (np.array(amplitudes) * np.sin(turns)).sum(axis=1)
-    return waves

@@ -67,7 +67,7 @@ def _shell(painter: Painter) -> list[Surface]:
 
 
 def _wall(painter: Painter, size_m: tuple[float, float]) -> Picture:
-    picture = painter.blank(size_m, painter.rng.uniform(135, 175))
+    picture = painter.blank(size_m, [painter.rng.uniform(135, 175)])
     painter.plaster(picture, 12)
     painter.leaves(picture, round(18 * size_m[0] * size_m[1]), (0.02, 0.4))
     painter.posters(picture, round(6 * size_m[0]), (0.5, 1.9))
@@ -75,7 +75,7 @@ def _wall(painter: Painter, size_m: tuple[float, float]) -> Picture:
 
 
 def _floor(painter: Painter, size_m: tuple[float, float]) -> Picture:
-    picture = painter.blank(size_m, 110)
+    picture = painter.blank(size_m, [110])
     painter.tiles(picture, 0.6, 12, -45)
     painter.plaster(picture, 12)
     painter.leaves(picture, round(25 * size_m[0] * size_m[1]), (0.03, 1.0))
@@ -83,7 +83,7 @@ def _floor(painter: Painter, size_m: tuple[float, float]) -> Picture:
 
 
 def _ceiling(painter: Painter, size_m: tuple[float, float]) -> Picture:
-    picture = painter.blank(size_m, 185)
+    picture = painter.blank(size_m, [185])
     painter.tiles(picture, 0.625, 8, -60)
     painter.plaster(picture, 6)
     painter.leaves(picture, round(6 * size_m[0] * size_m[1]), (0.03, 0.5))
@@ -92,7 +92,7 @@ def _ceiling(painter: Painter, size_m: tuple[float, float]) -> Picture:
 
 
 def _side(painter: Painter, size_m: tuple[float, float]) -> Picture:
-    picture = painter.blank(size_m, painter.rng.uniform(80, 200))
+    picture = painter.blank(size_m, [painter.rng.uniform(80, 200)])
     painter.plaster(picture, 12)
     painter.leaves(picture, round(60 * size_m[0] * size_m[1]) + 10, (0.03, 0.5))
     return picture

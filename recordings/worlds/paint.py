@@ -27,11 +27,16 @@ class Painter:
         self.texel_m = texel_m
         self._channels = 3 if is_colored else 1
 
-    def blank(self, size_m: tuple[float, float], level: float, spread: float = 0.0) -> Picture:
-        """Return a picture of one colour, whose channels differ by about `spread` from `level`."""
+    def color(self, level: float, spread: float) -> list[float]:
+        """Return a colour whose channels differ by up to `spread` from a level."""
+        color: list[float] = np.clip(level + self._shades(1, spread)[0], 0, 255).tolist()
+        return color
+
+    def blank(self, size_m: tuple[float, float], color: list[float]) -> Picture:
+        """Return a picture of one colour."""
         width, height = (max(4, round(side / self.texel_m)) for side in size_m)
         picture = np.empty((height, width, self._channels), np.uint8)
-        picture[:] = self._color(level, spread)
+        picture[:] = color
         return picture[..., 0] if self._channels == 1 else picture
 
     def plaster(self, picture: Picture, amplitude: float) -> None:
@@ -79,10 +84,10 @@ class Painter:
             self._poster(picture[y : y + h, x : x + w])
 
     def _poster(self, part: Picture) -> None:
-        part[:] = self._color(self.rng.uniform(15, 90), 15)
+        part[:] = self.color(self.rng.uniform(15, 90), 15)
         frame = max(1, round(0.02 / self.texel_m))
         inner = part[frame:-frame, frame:-frame]
-        inner[:] = self._color(self.rng.uniform(120, 240), 30)
+        inner[:] = self.color(self.rng.uniform(120, 240), 30)
         area_m2 = inner.shape[0] * inner.shape[1] * self.texel_m**2
         self.leaves(inner, round(220 * area_m2) + 12, (0.03, 0.5))
 
@@ -107,11 +112,7 @@ class Painter:
             for x in np.arange(step / 2, width, step):
                 centre = np.array([x, y]) + self.rng.uniform(-0.15, 0.15, 2) * step
                 corners = centre + size / 2 * [[-1, -1], [1, -1], [1, 1], [-1, 1]]
-                cv2.fillConvexPoly(picture, _drawn(corners), self._color(245, 5), cv2.LINE_8, _BITS)
-
-    def _color(self, level: float, spread: float) -> list[float]:
-        color: list[float] = np.clip(level + self._shades(1, spread)[0], 0, 255).tolist()
-        return color
+                cv2.fillConvexPoly(picture, _drawn(corners), self.color(245, 5), cv2.LINE_8, _BITS)
 
     def _shades(self, count: int, spread: float) -> FloatArray:
         return self.rng.uniform(-spread, spread, (count, self._channels))

@@ -49,6 +49,22 @@ class Rendering:
     surfaces: IntArray  # (H, W) row of the world's surfaces; -1 where nothing is
 
 
+def occluding_edges(view: Rendering, gap_m: float) -> BoolArray:
+    """Return the pixels (H, W) beside which something else lies farther away, by more than a gap."""
+    with np.errstate(divide="ignore"):
+        depths = np.where(view.inverse_depths > 0, 1 / view.inverse_depths, np.inf)
+    edges = np.zeros(depths.shape, np.bool_)
+    for near, far in (  # a pixel and its neighbour to each side
+        (np.s_[:, :-1], np.s_[:, 1:]),
+        (np.s_[:, 1:], np.s_[:, :-1]),
+        (np.s_[:-1], np.s_[1:]),
+        (np.s_[1:], np.s_[:-1]),
+    ):
+        differs = view.surfaces[near] != view.surfaces[far]
+        edges[near] |= differs & (depths[far] - depths[near] > gap_m)
+    return edges
+
+
 class Renderer:
     """Draws one world; safe to use from several threads."""
 

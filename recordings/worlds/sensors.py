@@ -8,12 +8,15 @@ from dataclasses import dataclass
 import numpy as np
 from pydantic import BaseModel, ConfigDict, NonNegativeFloat, PositiveFloat, PositiveInt
 
-from mapstream.recordings.worlds.motion import Motion
+from mapstream.recordings.worlds.motion import GRAVITY_MPS2, Motion
 from mapstream.recordings.worlds.ray_caster import RayCaster
 from mapstream.streams.arrays import FloatArray, IntArray
 from mapstream.streams.geometry import SE3, invert, se3_exp
 from mapstream.streams.messages.estimates import Odometry
 from mapstream.streams.messages.sensors import ImuBatch, LidarScan
+from mapstream.streams.sensors import ImuNoise, ImuSensor
+
+_LEAST_NOISE = 1e-9
 
 
 class LidarConfig(BaseModel):
@@ -45,6 +48,23 @@ class ImuConfig(BaseModel):
     accel_bias_mps2: NonNegativeFloat = 2.0e-2
     gyro_walk_radps2_rthz: NonNegativeFloat = 2.0e-5
     accel_walk_mps3_rthz: NonNegativeFloat = 3.0e-4
+
+    def sensor(self, sensor_id: str) -> ImuSensor:
+        """Return what a sensor file says of it; an IMU without noise is said to have little."""
+        return ImuSensor(
+            id=sensor_id,
+            topic="/imu",
+            frame="imu",
+            noise=ImuNoise(
+                gyro_density=max(self.gyro_noise_radps_rthz, _LEAST_NOISE),
+                gyro_random_walk=max(self.gyro_walk_radps2_rthz, _LEAST_NOISE),
+                accel_density=max(self.accel_noise_mps2_rthz, _LEAST_NOISE),
+                accel_random_walk=max(self.accel_walk_mps3_rthz, _LEAST_NOISE),
+            ),
+            gravity_mps2=GRAVITY_MPS2,
+            max_accel_mps2=150.0,
+            max_gyro_radps=15.0,
+        )
 
 
 class Lidar:

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from hashlib import md5
 from typing import Literal
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, NonNegativeFloat, PositiveFloat
 
-from mapstream.recordings.worlds.motion import GRAVITY_MPS2
 from mapstream.recordings.worlds.satellites import T_BASE_ANTENNA
 from mapstream.recordings.worlds.sensors import ImuConfig
+from mapstream.recordings.worlds.truth import sensor_id
 from mapstream.streams.calibration import CameraCalibration, CameraModel, Distortion
 from mapstream.streams.geometry import SE3, so3_exp
 from mapstream.streams.rig import Extrinsics, Rig
@@ -18,8 +17,6 @@ from mapstream.streams.sensors import (
     CameraMount,
     CameraRigSensor,
     CameraSensor,
-    ImuNoise,
-    ImuSensor,
     Sensor,
 )
 
@@ -128,11 +125,6 @@ class ViCameraConfig(BaseModel):
         )
 
 
-def sensor_id(name: str) -> str:
-    """Return the id of a sensor: 32 hex digits of its name."""
-    return md5(f"w_vi {name}".encode(), usedforsecurity=False).hexdigest()
-
-
 def claimed_places(
     config: ViCameraConfig, cameras: tuple[CameraName, ...], rng: np.random.Generator
 ) -> dict[CameraName, SE3]:
@@ -149,21 +141,7 @@ def claimed_places(
 def vi_rig(config: ViCameraConfig, places: dict[CameraName, SE3], imu: ImuConfig) -> Rig:
     """Return what the recording says of its sensors. The odometry's sensor is the base."""
     odometry = Sensor(id=sensor_id(BASE), kind="odometry", topic="/odometry", frame=BASE)
-    noise = ImuNoise(
-        gyro_density=imu.gyro_noise_radps_rthz,
-        gyro_random_walk=imu.gyro_walk_radps2_rthz,
-        accel_density=imu.accel_noise_mps2_rthz,
-        accel_random_walk=imu.accel_walk_mps3_rthz,
-    )
-    inertial = ImuSensor(
-        id=sensor_id("imu"),
-        topic="/imu",
-        frame="imu",
-        noise=noise,
-        gravity_mps2=GRAVITY_MPS2,
-        max_accel_mps2=150.0,
-        max_gyro_radps=15.0,
-    )
+    inertial = imu.sensor(sensor_id("imu"))
     satellites = Sensor(id=sensor_id("gnss"), kind="gps_wgs", topic="/gnss", frame="gnss")
     mounts = tuple(
         CameraMount(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from heapq import merge
 
 import numpy as np
@@ -10,17 +9,16 @@ from pydantic import BaseModel, ConfigDict, Field, NonNegativeFloat, NonNegative
 
 from mapstream.recordings.worlds.figure_eight import FlightConfig, eight, flight
 from mapstream.recordings.worlds.hall import Hall, Tag, hall
-from mapstream.recordings.worlds.motion import Motion
 from mapstream.recordings.worlds.renderer import Renderer
 from mapstream.recordings.worlds.satellites import SatelliteConfig, satellite_fixes
 from mapstream.recordings.worlds.sensors import (
     ImuConfig,
-    ImuSeries,
     drifting_odometry,
     imu_series,
 )
 from mapstream.recordings.worlds.simulation import Record, Simulation
 from mapstream.recordings.worlds.studio import Studio
+from mapstream.recordings.worlds.truth import stamps_at, true_odometry, true_places
 from mapstream.recordings.worlds.vi_rig import (
     T_BASE_CAMERA,
     T_BASE_IMU,
@@ -29,10 +27,6 @@ from mapstream.recordings.worlds.vi_rig import (
     claimed_places,
     vi_rig,
 )
-from mapstream.streams.arrays import IntArray
-from mapstream.streams.geometry import SE3
-from mapstream.streams.messages.estimates import Odometry
-from mapstream.streams.messages.sensors import TransformBatch
 
 START_NS = 1_700_000_000 * 10**9
 
@@ -72,7 +66,7 @@ def w_vi(config: WViConfig, seed: int) -> Simulation:
     motion, place = flight(config.flight, START_NS), vi_hall(config, seed)
     imu = imu_series(config.imu, T_BASE_IMU, motion, span_ns, imu_rng)
     claims = claimed_places(config.camera, config.cameras, rig_rng)
-    odometry_ns = _stamps(span_ns, 20.0)
+    odometry_ns = stamps_at(20.0, span_ns)
     odometry = drifting_odometry(
         motion.poses(odometry_ns),
         odometry_ns,
@@ -80,7 +74,7 @@ def w_vi(config: WViConfig, seed: int) -> Simulation:
         odometry_rng,
         turn_radpm=config.odometry_turn_radpm,
     )
-    fixes_ns = _stamps(span_ns, config.satellites.rate_hz)
+    fixes_ns = stamps_at(config.satellites.rate_hz, span_ns)
     fixes = satellite_fixes(config.satellites, motion, fixes_ns, satellite_rng)
     studio = Studio(config.camera, claims, Renderer(place.surfaces), motion, seed)
     readout_ns = round(config.camera.readout_s * 1e9)
@@ -89,14 +83,14 @@ def w_vi(config: WViConfig, seed: int) -> Simulation:
         end_ns=span_ns[1],
         rig=vi_rig(config.camera, claims, config.imu),
         records=merge(
-            [Record(START_NS, "/truth/tags", _places_of(place.tags))] if place.tags else [],
+            _tag_records(place.tags),
             (Record(m.stamp_ns, "/imu", m) for m in imu.batches()),
             (Record(m.stamp_ns, "/odometry", m) for m in odometry),
             (Record(m.stamp_ns, "/gnss", m) for m in fixes),
-            (Record(m.stamp_ns, "/truth", m) for m in _truth(motion, imu, span_ns)),
+            (Record(m.stamp_ns, "/truth", m) for m in true_odometry(motion, imu, span_ns)),
             (
                 Record(shot.taken_ns + readout_ns, f"/{shot.camera}/image", image)
-                for shot, image in studio.images(_stamps(span_ns, config.camera.rate_hz))
+                for shot, image in studio.images(stamps_at(config.camera.rate_hz, span_ns))
             ),
             key=lambda record: record.log_ns,
         ),
@@ -114,34 +108,8 @@ def vi_hall(config: WViConfig, seed: int) -> Hall:
     )
 
 
-def _stamps(span_ns: tuple[int, int], rate_hz: float) -> IntArray:
-    """Return stamps from the start to the end; none at a rate of 0."""
-    if rate_hz == 0:
-        return np.empty(0, np.int64)
-    num = int((span_ns[1] - span_ns[0]) * rate_hz / 1e9 + 1e-6) + 1
-    stamps: IntArray = span_ns[0] + np.rint(np.arange(num) * (1e9 / rate_hz)).astype(np.int64)
-    return stamps
-
-
-def _truth(motion: Motion, imu: ImuSeries, span_ns: tuple[int, int]) -> Iterator[Odometry]:
-    stamps_ns = _stamps(span_ns, 100.0)
-    rows = np.clip(np.searchsorted(imu.stamps_ns, stamps_ns), 0, len(imu.stamps_ns) - 1)
-    poses, velocities = motion.poses(stamps_ns), motion.velocities(stamps_ns)
-    for stamp_ns, row, T, velocity in zip(stamps_ns.tolist(), rows, poses, velocities, strict=True):
-        yield Odometry(
-            stamp_ns=stamp_ns,
-            T_odom_base=SE3(T),
-            velocity_mps=velocity,
-            gyro_bias_radps=imu.gyro_biases_radps[row],
-            accel_bias_mps2=imu.accel_biases_mps2[row],
-        )
-
-
-def _places_of(tags: tuple[Tag, ...]) -> TransformBatch:
-    return TransformBatch(
-        stamps_ns=np.full(len(tags), START_NS),
-        parents=("world",) * len(tags),
-        children=tuple(f"tag36h11:{tag.id}" for tag in tags),
-        T_parent_child=np.stack([tag.T_world_tag.matrix for tag in tags]),
-        is_static=True,
-    )
+def _tag_records(tags: tuple[Tag, ...]) -> list[Record]:
+    if not tags:
+        return []
+    places = {f"tag36h11:{tag.id}": tag.T_world_tag for tag in tags}
+    return [Record(START_NS, "/truth/tags", true_places(places, START_NS))]

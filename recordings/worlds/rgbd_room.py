@@ -1,0 +1,142 @@
+"""The room of the world W-RGBD: walls with pictures, a cupboard, and a table with six things on it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+
+from mapstream.recordings.worlds.paint import Painter, Picture
+from mapstream.recordings.worlds.surfaces import Paint, Surface, box_outline, prism, rectangle
+from mapstream.streams.arrays import FloatArray
+from mapstream.streams.geometry import SE3, so3_exp
+
+LENGTH_M, WIDTH_M, HEIGHT_M = 5.2, 4.4, 2.6
+TABLE_HEIGHT_M = 0.75
+_TABLE_M, _BOARD_M, _LEG_M = (1.4, 0.8), 0.04, 0.06
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Thing:
+    """An object on the table; its frame stands on the table's middle of it, z upwards."""
+
+    name: str  # its class
+    T_world_thing: SE3
+    outline_m: FloatArray  # (N, 2) convex, counter-clockwise from above
+    height_m: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Room:
+    """What stands where, around the origin; the floor is at z = 0, the table in the middle."""
+
+    surfaces: tuple[Surface, ...]
+    things: tuple[Thing, ...]
+
+
+def rgbd_room(seed: int, *, texel_m: float) -> Room:
+    """Return a room whose pictures depend on the seed, and where the things lie on the table."""
+    rng = np.random.default_rng(seed)
+    painter = Painter(rng, texel_m, is_colored=True)
+    things = _things(rng)
+    surfaces = [*_shell(painter), *_furniture(painter)]
+    fine = Painter(rng, texel_m / 2, is_colored=True)  # seen from near
+    for thing in things:
+        paint = _one_color(fine, rng.uniform(60, 220), 60, 1500)
+        surfaces += prism(thing.name, thing.T_world_thing, thing.outline_m, thing.height_m, paint)
+    return Room(tuple(surfaces), things)
+
+
+def _shell(painter: Painter) -> list[Surface]:
+    x, y, z = LENGTH_M / 2, WIDTH_M / 2, HEIGHT_M
+    wall, down = partial(_wall, painter), [0, 0, -z]
+    shell = partial(rectangle, is_shell=True)
+    return [
+        shell("wall_north", [-x, y, z], [2 * x, 0, 0], down, wall),
+        shell("wall_east", [x, y, z], [0, -2 * y, 0], down, wall),
+        shell("wall_south", [x, -y, z], [-2 * x, 0, 0], down, wall),
+        shell("wall_west", [-x, -y, z], [0, 2 * y, 0], down, wall),
+        shell("floor", [-x, y, 0], [2 * x, 0, 0], [0, -2 * y, 0], partial(_floor, painter)),
+        shell("ceiling", [-x, -y, z], [2 * x, 0, 0], [0, 2 * y, 0], partial(_ceiling, painter)),
+    ]
+
+
+def _wall(painter: Painter, size_m: tuple[float, float]) -> Picture:
+    picture = painter.blank(size_m, painter.color(painter.rng.uniform(160, 205), 18))
+    painter.plaster(picture, 12)
+    painter.leaves(picture, round(25 * size_m[0] * size_m[1]), (0.015, 0.2))
+    painter.posters(picture, round(8 * size_m[0]), (0.3, 0.9))
+    return picture
+
+
+def _floor(painter: Painter, size_m: tuple[float, float]) -> Picture:
+    picture = painter.blank(size_m, painter.color(105, 25))
+    painter.tiles(picture, 0.35, 14, -40)
+    painter.plaster(picture, 12)
+    painter.leaves(picture, round(30 * size_m[0] * size_m[1]), (0.015, 0.25))
+    return picture
+
+
+def _ceiling(painter: Painter, size_m: tuple[float, float]) -> Picture:
+    picture = painter.blank(size_m, painter.color(215, 5))
+    painter.plaster(picture, 5)
+    painter.lamps(picture, 2.2, (0.9, 0.2))
+    return picture
+
+
+def _one_color(painter: Painter, level: float, spread: float, leaves_per_m2: float) -> Paint:
+    """Return the paint of one thing: all its sides have one colour, and leaves on it."""
+    color = painter.color(level, spread)
+
+    def paint(size_m: tuple[float, float]) -> Picture:
+        picture = painter.blank(size_m, color)
+        painter.plaster(picture, 12)
+        count = round(leaves_per_m2 * size_m[0] * size_m[1])
+        painter.leaves(picture, count + 6, (0.008, 0.12))
+        return picture
+
+    return paint
+
+
+def _furniture(painter: Painter) -> list[Surface]:
+    """Return the table, a cupboard and two crates."""
+    wood = _one_color(painter, 150, 25, 80)
+    length, width = _TABLE_M
+    legs_m = TABLE_HEIGHT_M - _BOARD_M
+    surfaces = prism("table", _at(0, 0, legs_m), box_outline(length, width), _BOARD_M, wood)
+    x, y = length / 2 - _LEG_M, width / 2 - _LEG_M
+    for corner in ((x, y), (-x, y), (-x, -y), (x, -y)):
+        surfaces += prism("table", _at(*corner, 0), box_outline(_LEG_M, _LEG_M), legs_m, wood)
+    dark = _one_color(painter, 90, 20, 80)
+    surfaces += prism("cupboard", _at(-2.1, 1.93, 0), box_outline(0.9, 0.5), 1.8, dark)
+    surfaces += prism("crate", _at(2.2, -1.7, 0, 0.3), box_outline(0.45, 0.5), 0.55, dark)
+    return [*surfaces, *prism("crate", _at(2.25, 1.75, 0), box_outline(0.5, 0.5), 0.9, dark)]
+
+
+def _things(rng: np.random.Generator) -> tuple[Thing, ...]:
+    kinds: list[tuple[str, FloatArray, float]] = [
+        ("book", box_outline(0.24, 0.17), 0.05),
+        ("cereal_box", box_outline(0.20, 0.07), 0.30),
+        ("milk_carton", box_outline(0.10, 0.10), 0.22),
+        ("tin", _regular(8, 0.06), 0.14),
+        ("block", _regular(3, 0.10), 0.10),
+        ("shoe_box", box_outline(0.30, 0.19), 0.12),
+    ]
+    places = [(x, y) for y in (-0.2, 0.2) for x in (-0.45, 0.0, 0.45)]
+    order = rng.permutation(len(places))
+    things = []
+    for (name, outline, height), place in zip(kinds, order, strict=True):
+        x, y = np.array(places[place]) + rng.uniform(-0.04, 0.04, 2)
+        spot = _at(x, y, TABLE_HEIGHT_M, rng.uniform(0, 2 * np.pi))
+        things.append(Thing(name, spot, outline, height))
+    return tuple(things)
+
+
+def _regular(num_corners: int, radius_m: float) -> FloatArray:
+    angles = 2 * np.pi * np.arange(num_corners) / num_corners
+    return radius_m * np.stack([np.cos(angles), np.sin(angles)], axis=1)
+
+
+def _at(x: float, y: float, z: float, turn_rad: float = 0.0) -> SE3:
+    return SE3.from_rotation(so3_exp([0, 0, turn_rad]), [x, y, z])
