@@ -56,7 +56,7 @@ class IndexConfig(OperatorConfig):
     """For descriptors that are numbers."""
     dimensions: PositiveInt = 10
     """Numbers to which the multi-index projects bits; even."""
-    words: PositiveInt = 48
+    words: PositiveInt = 24
     """Cells that the multi-index looks into: more find more and take longer."""
     exact_up_to: NonNegativeInt = 20_000
     """Descriptors below which the multi-index compares all of them."""
