@@ -19,13 +19,22 @@ def with_rig(config: TrajectoryConfig) -> TrajectoryConfig:
     """
     if config.imu is None:
         return config
-    sensor = _sensor(config.imu)
+    return config.model_copy(update={"imu": described(config.imu)})
+
+
+def described(config: ImuConfig) -> ImuConfig:
+    """Return an IMU's config with what the rig says of it where nothing was given.
+
+    Raises:
+        ConfigError: If the sensor file is wrong, or has no such IMU.
+        RecordingError: If the recording cannot be read.
+    """
+    sensor = _sensor(config)
     if sensor is None:
         return config
     known = ImuParameters.from_sensor(sensor)
-    fresh = known.model_fields_set & ImuConfig.model_fields.keys() - config.imu.model_fields_set
-    imu = config.imu.model_copy(update={name: getattr(known, name) for name in fresh})
-    return config.model_copy(update={"imu": imu})
+    fresh = known.model_fields_set & ImuConfig.model_fields.keys() - config.model_fields_set
+    return config.model_copy(update={name: getattr(known, name) for name in fresh})
 
 
 def _sensor(config: ImuConfig) -> ImuSensor | None:

@@ -1,0 +1,1 @@
+"""Odometry from one or more cameras and an IMU."""
