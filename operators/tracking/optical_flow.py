@@ -27,6 +27,8 @@ class FlowOptions(OperatorConfig):
     num_iterations: PositiveInt = 20
     max_forward_backward_px: PositiveFloat = 1.0
     """So far from its start a patch may come back when it is followed there and back."""
+    max_difference: PositiveFloat = 25.0
+    """How much a patch may change, on average [grey values]."""
 
 
 def follow(
@@ -57,7 +59,7 @@ def follow(
         "flags": cv2.OPTFLOW_USE_INITIAL_FLOW,
     }
     now = _as_bright(now, before)
-    found, is_found, _ = cv2.calcOpticalFlowPyrLK(
+    found, is_found, difference = cv2.calcOpticalFlowPyrLK(
         before, now, px, guess_px.copy(), maxLevel=options.num_levels, **settings
     )
     # on the way back the start is close: a small pyramid will do
@@ -68,6 +70,7 @@ def follow(
     places = np.asarray(found, np.float32)
     error_px = np.linalg.norm(back - px, axis=1)
     good = is_found.reshape(-1).astype(bool) & is_back.reshape(-1).astype(bool)
+    good &= difference.reshape(-1) <= options.max_difference
     good &= error_px <= options.max_forward_backward_px
     good &= ((places >= 0) & (places <= [width - 1, height - 1])).all(axis=1)
     return places, good
