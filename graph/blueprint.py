@@ -9,14 +9,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import numpy as np
 import rerun.blueprint as rrb
 
 from mapstream.graph.plan import Plan
 from mapstream.graph.tap_outputs import Output
 from mapstream.graph.views.run import GRAPH, graph_extent
 from mapstream.recordings.maps import Map
-from mapstream.streams.arrays import FloatArray
 from mapstream.streams.messages import estimates, sensors, vision
 
 _IN_SPACE = (
@@ -40,7 +38,7 @@ _KNOWN = (
     sensors.TransformBatch,
     vision.ImageFeatures,
 )
-_CLOSED = (rrb.BlueprintPanel(state="collapsed"), rrb.SelectionPanel(state="collapsed"))
+CLOSED = (rrb.BlueprintPanel(state="collapsed"), rrb.SelectionPanel(state="collapsed"))
 _HIDDEN = rrb.EntityBehavior(visible=False)
 
 
@@ -56,27 +54,16 @@ def blueprint_of(plan: Plan, outputs: Sequence[Output]) -> rrb.Blueprint:
     return rrb.Blueprint(
         rrb.Horizontal(main, rrb.Vertical(*shown), column_shares=[5, 2]),
         rrb.TimePanel(timeline="stamp", state="collapsed"),
-        *_CLOSED,
+        *CLOSED,
     )
 
 
-def map_blueprint(path: FloatArray) -> rrb.Blueprint:
-    """Return the layout for a stored map, seen from a height that shows all of its path (N, 3)."""
-    low, high = (path.min(axis=0), path.max(axis=0)) if len(path) else (np.zeros(3), np.zeros(3))
-    middle, size_m = (low + high) / 2, float(np.linalg.norm(high - low)) + 10.0
-    eye = rrb.EyeControls3D(
-        position=middle + size_m * np.array([0.0, -0.45, 0.65]),
-        look_target=middle,
-        eye_up=(0.0, 0.0, 1.0),
-    )
-    time = rrb.TimePanel(timeline="stamp", state="collapsed")
-    states = rrb.TimeSeriesView(name="States", origin="/states")
-    main = rrb.Tabs(map_view([], eye), states)
-    return rrb.Blueprint(main, time, *_CLOSED)
-
-
-def map_view(outputs: Sequence[Output], eye: rrb.EyeControls3D | None = None) -> rrb.Spatial3DView:
-    """Return the view of all that has a place, seen from the map's frame."""
+def map_view(
+    outputs: Sequence[Output] = (),
+    eye: rrb.EyeControls3D | None = None,
+    hidden_paths: Sequence[str] = (),
+) -> rrb.Spatial3DView:
+    """Return the view of all that has a place, seen from the map's frame; some is drawn once it is ticked."""
     has_clouds = any(output.sends(estimates.PointCloud) for output in outputs)
     hidden = [o.path for o in outputs if o.sends(estimates.Keyframe)]
     hidden += [o.path for o in outputs if has_clouds and o.sends(sensors.LidarScan)]
@@ -85,7 +72,7 @@ def map_view(outputs: Sequence[Output], eye: rrb.EyeControls3D | None = None) ->
         name="Map",
         origin="/",
         contents=["+ /map/**", *(f"+ /{output.path}/**" for output in outputs)],
-        overrides={f"/{path}": _HIDDEN for path in hidden},
+        overrides=dict.fromkeys((*hidden_paths, *(f"/{path}" for path in hidden)), _HIDDEN),
         eye_controls=eye,
         background=rrb.Background(color=0x0B0E14FF),
         line_grid=rrb.LineGrid3D(visible=True, spacing=10.0, color=0xFFFFFF10),

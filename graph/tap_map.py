@@ -6,8 +6,6 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import numpy as np
-
 from mapstream.graph.tap_sinks import Sink
 from mapstream.operators.maps.aggregate import AggregateConfig, aggregate_cloud
 from mapstream.recordings.maps import Map
@@ -40,7 +38,7 @@ def view_map(
     Raises:
         MapError: If no viewer answers, or the one that did takes nothing.
     """
-    from mapstream.graph.blueprint import map_blueprint  # noqa: PLC0415  # imports rerun
+    from mapstream.graph.map_blueprint import map_blueprint  # noqa: PLC0415  # imports rerun
     from mapstream.graph.views import Scene, view_of  # noqa: PLC0415
     from mapstream.graph.views.maps import cloud_entry  # noqa: PLC0415
 
@@ -54,8 +52,7 @@ def view_map(
         except MapError as error:  # a map without clouds still has trajectories
             notes.append(f"rerun: the map is drawn without clouds: {error}")
     end_s = time.monotonic() + sink.patience_s
-    path = map_.T_map_base(np.arange(len(map_.vertices)))[:, :3, 3]
-    while not sink.try_open(map_blueprint(path)):
+    while not sink.try_open(map_blueprint(map_)):
         if time.monotonic() > end_s:
             raise MapError("rerun: no viewer answered; start one with `rerun`, or try save=FILE")
         time.sleep(0.2)
