@@ -5,13 +5,12 @@ Source: Cramariuc et al., maplab 2.0, RA-L 2023, section III-A: 3D observations 
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
 
 from mapstream.operators.estimation.factors.landmarks import shape_of
-from mapstream.operators.estimation.factors.mounts import mounts
+from mapstream.operators.landmarks.views import views_of
 from mapstream.recordings.maps.model import Map
 from mapstream.streams.arrays import FloatArray, IntArray
 from mapstream.streams.geometry import invert
@@ -27,7 +26,7 @@ def averaged_landmarks(map_: Map) -> Map:
     """
     is_point = np.array([shape_of(kind) == "point" for kind in map_.landmarks.kind], dtype=bool)
     sums, counts = np.zeros((len(is_point), 3)), np.zeros(len(is_point), np.int64)
-    for landmarks, points in (_of_edges(map_), *_of_observations(map_)):
+    for landmarks, points in (_of_edges(map_), _of_observations(map_)):
         np.add.at(sums, landmarks, points)
         np.add.at(counts, landmarks, 1)
     rows = np.flatnonzero(is_point & (counts > 0))
@@ -48,16 +47,7 @@ def _of_edges(map_: Map) -> tuple[IntArray, FloatArray]:
     return edges.landmark_a[rows], seen[:, :3, 3]
 
 
-def _of_observations(map_: Map) -> Iterator[tuple[IntArray, FloatArray]]:
-    """Yield the landmarks and points (N, 3) that each sensor of each mission saw."""
+def _of_observations(map_: Map) -> tuple[IntArray, FloatArray]:
     seen = map_.observations
-    is_point = np.isfinite(seen.p_sensor).all(axis=1) & (seen.landmark >= 0)
-    places = {(mount.mission, mount.name): mount.T_base_sensor for mount in mounts(map_)}
-    mission_of = map_.vertices.mission[seen.vertex]
-    for name in sorted(set(seen.sensor[is_point])):
-        for mission in np.unique(mission_of[is_point & (seen.sensor == name)]).tolist():
-            rows = np.flatnonzero(is_point & (seen.sensor == name) & (mission_of == mission))
-            T_base_sensor = places.get((mission, name), np.eye(4))
-            p_sensor = np.column_stack([seen.p_sensor[rows], np.ones(len(rows))])
-            T_map_sensor = map_.T_map_base(seen.vertex[rows]) @ T_base_sensor
-            yield seen.landmark[rows], np.einsum("nij,nj->ni", T_map_sensor, p_sensor)[:, :3]
+    rows = np.flatnonzero(np.isfinite(seen.p_sensor).all(axis=1) & (seen.landmark >= 0))
+    return seen.landmark[rows], views_of(map_, rows).points

@@ -1,0 +1,1 @@
+"""Landmarks of a map: made from tracks, located, judged, merged and removed."""
