@@ -5,6 +5,7 @@ Source: Cramariuc et al., maplab 2.0, RA-L 2023, section III-A2 (any number of k
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
@@ -64,7 +65,22 @@ def add_features(
         for _, _, f in reversed(seen)
         if f.camera is not None and f.frame not in known
     }
-    return with_cameras(map_, mission_row, new) if new else map_
+    map_ = with_cameras(map_, mission_row, new) if new else map_
+    return _with_places(map_, mission_row, [f for _, _, f in seen if f.camera is None])
+
+
+def _with_places(map_: Map, mission_row: int, seen: Sequence[ImageFeatures]) -> Map:
+    """Return the map with the places of sensors that are no cameras, where the mission does not know them."""
+    sensors = json.loads(map_.missions.sensors[mission_row])
+    known = {*sensors, *sensors.get("cameras", {})}
+    places = {f.frame: f.T_base_sensor for f in reversed(seen) if f.frame not in known}
+    if not places:
+        return map_
+    for name, place in places.items():
+        sensors[name] = {"T_base_sensor": [*place.t.tolist(), *place.quat_xyzw.tolist()]}
+    texts = map_.missions.sensors.copy()
+    texts[mission_row] = json.dumps(sensors, sort_keys=True)
+    return replace(map_, missions=replace(map_.missions, sensors=texts))
 
 
 def descriptors_of(map_: Map, rows: IntArray) -> Descriptors:
