@@ -98,7 +98,7 @@ def _unprojected(camera: CameraCalibration, px: FloatArray) -> FloatArray:
     if camera.distortion == "none":
         return unproject(camera, px)
     size = np.array([camera.width_px, camera.height_px])
-    outside: BoolArray = ((px < 0) | (px > size - 1)).any(axis=1)
+    outside = np.any((px < 0) | (px > size - 1), axis=1)
     found = rays(camera, np.where(outside[:, None], 0, px))
     found[outside] = unproject(camera, px[outside])
     return found

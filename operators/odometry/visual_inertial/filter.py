@@ -63,7 +63,7 @@ class Filter:
         self._T_imu_base = T_base_imu.inverse().matrix
         self._limits = limits
         self._sightings = Sightings.none()
-        self._standstill = Standstill()
+        self._standstill = Standstill(is_standing=state.is_standing)
         self._standing_clone: int | None = None  # of the last n-frame, if it stood then
         self._resting_R: FloatArray | None = None  # the attitude in which it came to rest
         self._next_id = 0
@@ -76,6 +76,7 @@ class Filter:
         if motion.stamps_ns[-1] > state.stamp_ns:
             propagate(state, motion, self._imu)
         is_standing = self._standstill.judge(state.stamp_ns, rays, motion)
+        state.is_standing = is_standing
         if not is_standing:
             self._resting_R = None
         else:

@@ -69,6 +69,7 @@ def start_at_rest(held: list[Held], motion: Motion, imu: ImuQuality) -> FilterSt
         gyro_bias=gyro.mean(axis=0),
         accel_bias=np.zeros(3),
         covariance=covariance,
+        is_standing=True,
     )
 
 

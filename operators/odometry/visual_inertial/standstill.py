@@ -38,13 +38,17 @@ _SIGMA_MPS, _SIGMA_M, _SIGMA_RAD = 0.005, 0.0005, 0.0005
 
 
 class Standstill:
-    """Judges n-frames in their order."""
+    """Judges n-frames in their order.
 
-    def __init__(self) -> None:
+    Args:
+        is_standing: Whether the robot is known to stand at the first one.
+    """
+
+    def __init__(self, *, is_standing: bool) -> None:
         self._seen: deque[tuple[int, Rays, FloatArray]] = (
             deque()
         )  # stamp, rays, mean of the samples
-        self.is_standing = False
+        self.is_standing = is_standing
 
     def judge(self, stamp_ns: int, rays: Rays, motion: Motion) -> bool:
         """Return whether the robot has stood still for a while; `motion` is that since the last n-frame."""
@@ -53,7 +57,7 @@ class Standstill:
         while len(self._seen) > 2 and self._seen[1][0] <= stamp_ns - _SPAN_NS:
             self._seen.popleft()
         start_ns, before, _ = self._seen[0]
-        is_long = stamp_ns - start_ns >= 0.9 * _SPAN_NS
+        is_long = self.is_standing or stamp_ns - start_ns >= 0.9 * _SPAN_NS
         seen_still = is_still(before, self._seen[-2][1] if len(self._seen) > 1 else before, rays)
         seems_still = self.is_standing if seen_still is None else seen_still
         self.is_standing = bool(
@@ -64,7 +68,7 @@ class Standstill:
     def _is_calm(self) -> bool:
         means = np.array([mean for _, _, mean in self._seen][1:])
         if len(means) < 2:
-            return False
+            return self.is_standing
         change = np.abs(
             means[-1] - means[:-1].mean(axis=0)
         )  # the last may be the first of a motion

@@ -40,6 +40,7 @@ class FilterState:
     keys: IntArray = field(default_factory=lambda: np.empty(0, np.int64))  # (L,) of points
     points: FloatArray = field(default_factory=lambda: np.empty((0, 3)))  # (L, 3) [m]
     first_points: FloatArray = field(default_factory=lambda: np.empty((0, 3)))  # where they began
+    is_standing: bool = False  # whether the robot is known to stand
 
     @property
     def T_odom_imu(self) -> SE3:
