@@ -37,6 +37,7 @@ _KNOWN = (
     sensors.GnssFix,
     sensors.TransformBatch,
     vision.ImageFeatures,
+    vision.NFrame,
 )
 CLOSED = (rrb.BlueprintPanel(state="collapsed"), rrb.SelectionPanel(state="collapsed"))
 _HIDDEN = rrb.EntityBehavior(visible=False)
@@ -84,22 +85,26 @@ def _cameras(plan: Plan, outputs: Sequence[Output]) -> list[rrb.View]:
     features = [output for output in outputs if output.sends(vision.ImageFeatures)]
     views: list[rrb.View] = []
     for picture in (output for output in outputs if output.sends(*_PICTURES)):
-        readers = _readers(plan, picture)
-        found = [f for f in features if f.edge.from_node in readers]
+        made_of_it = _made_of(plan, (picture.edge.from_node, picture.edge.from_port))
+        found = [f for f in features if (f.edge.from_node, f.edge.from_port) in made_of_it]
         contents = [f"+ /{output.path}/**" for output in (picture, *found)]
         views.append(rrb.Spatial2DView(name=picture.path, origin="/", contents=contents))
     return views
 
 
-def _readers(plan: Plan, output: Output) -> set[str]:
-    """Return all operators that read an output, or what its readers make of it."""
-    source = output.edge.from_node, output.edge.from_port
-    readers = {e.to_node for e in plan.edges if (e.from_node, e.from_port) == source}
-    while True:
-        more = {e.to_node for e in plan.edges if e.from_node in readers}
-        if more <= readers:
-            return readers
-        readers |= more
+def _made_of(plan: Plan, source: tuple[str, str]) -> set[tuple[str, str]]:
+    """Return all outputs that are made of one output; of a stereo pair, what is made of the same side."""
+    found, new = {source}, {source}
+    while new:
+        readers = {(e.to_node, e.to_port) for e in plan.edges if (e.from_node, e.from_port) in new}
+        new = {
+            (node, made)
+            for node, read in readers
+            for made in plan.nodes[node].signature.outputs
+            if made.startswith("right_") == read.startswith("right_")
+        } - found
+        found |= new
+    return found
 
 
 def _plots(outputs: Sequence[Output]) -> list[rrb.View]:
@@ -119,6 +124,17 @@ def _plots(outputs: Sequence[Output]) -> list[rrb.View]:
         for output in outputs
         if output.sends(sensors.ImuBatch)
         for name, entity in (("[rad/s]", "gyro"), ("[m/s²]", "accel"))
+    ]
+    plots += [
+        rrb.TimeSeriesView(name=f"{output.path} keypoints", origin=f"/{output.path}")
+        for output in outputs
+        if output.sends(vision.NFrame)
+    ]
+    tracked = [output.path for output in outputs if output.sends(vision.ImageFeatures)]
+    plots += [
+        rrb.TimeSeriesView(name=name, origin="/", contents=[f"+ /{p}/{entity}" for p in tracked])
+        for name, entity in (("Tracks", "num_tracks"), ("Track length", "mean_length"))
+        if tracked
     ]
     return plots
 

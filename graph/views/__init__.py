@@ -18,7 +18,6 @@ from mapstream.graph.views.constraints import view_constraint
 from mapstream.graph.views.images import (
     view_camera_frame,
     view_encoded_image,
-    view_image_features,
 )
 from mapstream.graph.views.lidar import view_laser_scan, view_lidar_scan, view_point_cloud
 from mapstream.graph.views.mapping import (
@@ -37,6 +36,7 @@ from mapstream.graph.views.motion import (
 )
 from mapstream.graph.views.run import operator_graph, view_snapshot
 from mapstream.graph.views.scene import Columns, Entry, Scene, View, ViewSettings
+from mapstream.graph.views.tracks import view_image_features, view_n_frame
 from mapstream.graph.views.unknown import view_unknown
 from mapstream.recordings.maps import Map
 from mapstream.streams.messages import constraints, estimates, sensors, vision
@@ -71,6 +71,7 @@ _BUILT_IN: dict[type, View] = {
     estimates.LoopReport: view_loop_report,
     estimates.MapCorrection: view_map_correction,
     vision.ImageFeatures: view_image_features,
+    vision.NFrame: view_n_frame,
     Map: view_map,
     Snapshot: view_snapshot,
 }

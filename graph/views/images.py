@@ -1,18 +1,14 @@
-"""Images and what was found in them."""
+"""Images, as they were taken."""
 
 from __future__ import annotations
-
-from typing import Any
 
 import numpy as np
 import rerun as rr
 
-from mapstream.graph.views.colors import KEYPOINT, ramp_colors
 from mapstream.graph.views.scene import Drawing, Entry, Scene
 from mapstream.graph.views.unknown import view_unknown
 from mapstream.streams.errors import MappingError
 from mapstream.streams.messages.sensors import CameraFrame, EncodedImage
-from mapstream.streams.messages.vision import ImageFeatures
 
 _DEPTH_METER = {"16UC1": 1000.0, "32FC1": 1.0}  # value of a metre, by encoding
 _COLOR_MODEL = {"bgr8": rr.ColorModel.BGR, "rgb8": rr.ColorModel.RGB}
@@ -39,19 +35,6 @@ def view_encoded_image(image: EncodedImage, scene: Scene) -> Drawing:
     if not media_types:
         return view_unknown(image, scene)
     return [Entry.of("", rr.EncodedImage(contents=image.data.tobytes(), media_type=media_types[0]))]
-
-
-def view_image_features(features: ImageFeatures, scene: Scene) -> Drawing:  # noqa: ARG001  # a view
-    """Draw keypoints over their image: the brighter, the better; their size where they have one."""
-    scores, scales = features.scores, features.scales
-    colors: Any = KEYPOINT
-    if scores is not None and len(scores):
-        colors = ramp_colors(scores, float(scores.min()), float(scores.max()), "viridis")
-    radii: Any = rr.Radius.ui_points(2.5)
-    if scales is not None and len(scales):
-        radii = np.clip(scales / 8, 1.5, 12)  # the true diameter would hide the picture
-    points = rr.Points2D(features.keypoints_px, colors=colors, radii=radii, draw_order=10.0)
-    return [Entry.of("", points)]
 
 
 def _jpeg(frame: CameraFrame, quality: int) -> bytes:

@@ -67,15 +67,16 @@ class Klt(Operator[Inputs, Outputs]):
             if reason is not None:
                 report_loss(reason)
                 outputs.features.advance(frame.stamp_ns)
+                outputs.right_features.advance(frame.stamp_ns)
                 continue
             await outputs.features.send(await offload(tracker.track, frame, turn, detections))
             if inputs.right_frames is None:
                 continue
             if right is None:
                 warn(f"images of {frame.frame} without one of the right camera")
-                continue
-            reason = wrong_size(right) or unlike(frame, right)
-            if reason is None:
-                await outputs.right_features.send(await offload(tracker.track_right, frame, right))
-            else:
+            elif (reason := wrong_size(right) or unlike(frame, right)) is not None:
                 report_loss(reason)
+            else:
+                await outputs.right_features.send(await offload(tracker.track_right, frame, right))
+                continue
+            outputs.right_features.advance(frame.stamp_ns)

@@ -1,0 +1,110 @@
+"""Keypoints, tracks, matches and what ended, over their images."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import rerun.blueprint as rrb
+
+from mapstream.graph.blueprint import blueprint_of
+from mapstream.graph.tap_outputs import drawn_outputs
+from mapstream.graph.views.colors import ramp_colors
+from mapstream.operators.sources.mcap import McapSource
+from mapstream.operators.tracking.klt import Klt
+from mapstream.operators.tracking.n_frames import NFrames
+from mapstream.streams.messages.vision import NO_TRACK, ImageFeatures, NFrame
+from tests.graph.made_plans import make_plan, node
+from tests.graph.rrd import values_of
+from tests.graph.test_views import drawn
+
+_FIRST = ImageFeatures(
+    stamp_ns=10**9,
+    kind="klt",
+    frame="left",
+    keypoints_px=np.array([[10, 10], [50, 20], [90, 30], [5, 70]]),
+    track_ids=np.array([7, 8, 9, NO_TRACK]),
+)
+
+
+def test_P4_tracks_have_tails_in_the_colour_of_their_length(tmp_path: Path) -> None:
+    images = [
+        replace(
+            _FIRST,
+            stamp_ns=_FIRST.stamp_ns + i * 50_000_000,
+            keypoints_px=_FIRST.keypoints_px + np.array([2 * i, 0], np.float32),
+            track_ids=np.array([7, 8, 9 if i < 15 else 100 + i, NO_TRACK]),
+        )
+        for i in range(20)
+    ]
+
+    entities = drawn(tmp_path, images)
+
+    tails = values_of(entities["/op/port/tails"], "LineStrips2D:strips")
+    assert [[len(strip) for strip in strips] for strips in tails[:2]] == [[1] * 3, [2] * 3]
+    assert [len(strip) for strip in tails[-1]] == [12, 12, 1]
+    np.testing.assert_allclose(np.array(tails[-1][0])[:, 0], 10 + 2 * np.arange(8, 20))
+    colors = values_of(entities["/op/port/tracks"], "Points2D:colors")
+    assert colors[-1] == ramp_colors(np.array([20.0, 20.0, 1.0]), 1, 30).tolist()
+    ended = values_of(entities["/op/port/ended"], "Points2D:positions")
+    assert [len(points) for points in ended] == [0] * 15 + [1] * 5
+    assert ended[15] == [[90 + 2 * 14, 30]]
+    assert [len(p) for p in values_of(entities["/op/port"], "Points2D:positions")] == [1] * 20
+    lengths = values_of(entities["/op/port/mean_length"], "Scalars:scalars")
+    assert lengths[0] == [1.0]
+    assert lengths[-1] == [(20 + 20 + 1) / 3]
+
+
+def test_P4_lines_lead_to_the_same_points_in_the_other_camera(tmp_path: Path) -> None:
+    right = replace(
+        _FIRST, frame="right", keypoints_px=_FIRST.keypoints_px - np.array([4, 0], np.float32),
+        track_ids=np.array([9, 8, NO_TRACK, NO_TRACK]),
+    )  # fmt: skip
+    later = replace(right, stamp_ns=right.stamp_ns + 50_000_000)
+
+    entities = drawn(tmp_path, [_FIRST, right, later])
+
+    none, lines, too_late = values_of(entities["/op/port/matches"], "LineStrips2D:strips")
+    assert none == too_late == []
+    assert sorted(lines) == [[[50, 20], [46, 20]], [[90, 30], [6, 10]]]
+
+
+def test_an_n_frame_is_a_plot_of_counts(tmp_path: Path) -> None:
+    other = replace(_FIRST, kind="sift", keypoints_px=np.ones((2, 2), np.float32), track_ids=None)
+
+    entities = drawn(tmp_path, [NFrame(stamp_ns=10**9, features=(_FIRST, other))])
+
+    assert values_of(entities["/op/port/left/klt"], "Scalars:scalars") == [[4.0]]
+    assert values_of(entities["/op/port/left/sift"], "Scalars:scalars") == [[2.0]]
+
+
+def test_P4_each_image_of_a_pair_shows_its_own_keypoints() -> None:
+    images = node(McapSource, path="x.mcap", topics={
+        "left": {"topic": "/l", "type": "CameraFrame"}, "right": {"topic": "/r", "type": "CameraFrame"},
+    })  # fmt: skip
+    plan = make_plan(
+        {"cameras": images, "klt": node(Klt), "joined": node(NFrames, inputs=["a", "b"])},
+        "cameras.left -> klt.frames",
+        "cameras.right -> klt.right_frames",
+        "klt.features -> joined.a",
+        "klt.right_features -> joined.b",
+    )
+
+    views = list(_views(blueprint_of(plan, drawn_outputs(plan)).root_container))
+
+    contents = {view.name: view.contents for view in views if "cameras" in str(view.name)}
+    assert contents == {
+        "cameras/left": ["+ /cameras/left/**", "+ /klt/features/**"],
+        "cameras/right": ["+ /cameras/right/**", "+ /klt/right_features/**"],
+    }
+
+
+def _views(container: rrb.Container) -> Iterator[Any]:
+    for child in container.contents:
+        if isinstance(child, rrb.Container):
+            yield from _views(child)
+        else:
+            yield child
