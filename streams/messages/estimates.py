@@ -144,6 +144,9 @@ class LoopCandidate:
     verdict: str  # "accepted", or the reason for the refusal
     inlier_fraction: float = float("nan")
     rmse_m: float = float("nan")
+    num_matches: int = 0  # of features
+    num_inliers: int = 0
+    score: float = float("nan")  # by which it was chosen among other places
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
