@@ -73,13 +73,14 @@ class Filter:
         """Go on to the n-frame at the end of `motion`; of the first one the motion has no length."""
         state = self.state
         known_before = _last_clone(state)
-        if motion.stamps_ns[-1] > state.stamp_ns:
+        has_passed = motion.stamps_ns[-1] > state.stamp_ns
+        if has_passed:
             propagate(state, motion, self._imu)
         is_standing = self._standstill.judge(state.stamp_ns, rays, motion)
         state.is_standing = is_standing
         if not is_standing:
             self._resting_R = None
-        else:
+        elif has_passed:
             self._resting_R = state.R if self._resting_R is None else self._resting_R
             stand(state, motion, self._imu, self._resting_R)
         clone_id = self._next_id
