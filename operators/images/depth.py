@@ -1,11 +1,11 @@
-"""What a pixel of a depth image says, and how sure it is."""
+"""What a pixel of a depth image says."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from mapstream.operators.images.frame_filter import DEPTHS, require_encoding
-from mapstream.streams.arrays import Float32Array, FloatArray
+from mapstream.streams.arrays import Float32Array
 from mapstream.streams.messages.sensors import CameraFrame
 
 
@@ -22,13 +22,3 @@ def depth_m_of(frame: CameraFrame, *, least_m: float = 0.0, most_m: float = np.i
     with np.errstate(invalid="ignore"):
         is_seen = (depth_m > least_m) & (depth_m < most_m)
     return np.where(is_seen, depth_m, np.float32(np.nan))
-
-
-def depth_sigma_m(depth_m: FloatArray) -> FloatArray:
-    """Return the deviation [m] of depths (N,) of structured light.
-
-    Nguyen, Izadi, Lovell: Modeling Kinect Sensor Noise for Improved 3D Reconstruction and Tracking,
-    3DIMPVT 2012: the axial deviation grows with the square of the depth.
-    """
-    sigma_m: FloatArray = 0.0012 + 0.0019 * (depth_m - 0.4) ** 2
-    return sigma_m
