@@ -15,9 +15,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mapstream.streams.arrays import FloatArray
+from mapstream.streams.arrays import BoolArray, FloatArray
 from mapstream.streams.calibration import CameraCalibration
-from mapstream.streams.distortion import BoolArray, distort, distortion_by_parameters, undistort
+from mapstream.streams.distortion import distort, distortion_by_parameters, undistort
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -17,12 +17,9 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-import numpy.typing as npt
 
 from mapstream.streams.arrays import FloatArray
 from mapstream.streams.calibration import Distortion
-
-BoolArray = npt.NDArray[np.bool_]
 
 _CONVERGED = 1e-10  # of the normalised plane: 1e-7 px at a focal length of 1000 px
 _MAX_STEPS = 100

@@ -1,8 +1,4 @@
-"""A simulated depth camera: a grid of rays through one point, with the noise of structured light.
-
-Noise: Nguyen, Izadi, Lovell: Modeling Kinect Sensor Noise for Improved 3D Reconstruction and Tracking,
-3DIMPVT 2012: the axial deviation grows with the square of the depth.
-"""
+"""A simulated depth camera: a grid of rays through one point, with the noise of structured light."""
 
 from __future__ import annotations
 
@@ -12,11 +8,12 @@ from pydantic import BaseModel, ConfigDict, NonNegativeFloat, PositiveFloat, Pos
 from mapstream.recordings.worlds.ray_caster import RayCaster
 from mapstream.streams.arrays import FloatArray
 from mapstream.streams.messages.sensors import LidarScan
+from mapstream.streams.structured_light import depth_sigma_m
 
 
 def with_depth_noise(depth_m: FloatArray, times: float, rng: np.random.Generator) -> FloatArray:
-    """Return depths as structured light measures them, with a multiple of the paper's noise."""
-    sigma_m = times * (0.0012 + 0.0019 * (depth_m - 0.4) ** 2)
+    """Return depths as structured light measures them, with a multiple of its noise."""
+    sigma_m = times * depth_sigma_m(depth_m)
     noisy: FloatArray = depth_m + rng.normal(0.0, 1.0, depth_m.shape) * sigma_m
     return noisy
 
@@ -33,7 +30,7 @@ class DepthCameraConfig(BaseModel):
     min_depth_m: NonNegativeFloat = 0.5
     max_depth_m: PositiveFloat = 4.0
     noise: NonNegativeFloat = 1.0
-    """Times that of the paper."""
+    """Times that of structured light."""
 
 
 class DepthCamera:

@@ -17,8 +17,7 @@ import numpy as np
 
 from mapstream.recordings.worlds.paint import Picture
 from mapstream.recordings.worlds.surfaces import Surface, pyramid
-from mapstream.streams.arrays import Float32Array, FloatArray, IntArray
-from mapstream.streams.distortion import BoolArray
+from mapstream.streams.arrays import BoolArray, Float32Array, FloatArray, IntArray
 
 A = TypeVar("A", Picture, Float32Array, IntArray)
 
