@@ -11,29 +11,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from mapstream.operators.odometry.visual.sightings import Views
 from mapstream.streams.arrays import FloatArray, IntArray
 from mapstream.streams.geometry import hat
 
 _STEPS = 4
 _LEAST_INVERSE = 1e-4  # [1/m]: what is farther than 10 km is at 10 km
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Views:
-    """Who saw each of F points, and where: at most M views of a point, unused ones with weight zero.
-
-    All in one frame, the world. `rows` is the weight of `rays.Rays` turned into it: a point f has the
-    residual rows @ (f - centres) / |f - centres|.
-    """
-
-    rows: FloatArray  # (F, M, 2, 3)
-    centres: FloatArray  # (F, M, 3) [m]; of unused views that of the first one
-    first: FloatArray  # (F, 3) unit direction in which the first view sees the point
-    counts: IntArray  # (F,)
-
-    def chosen(self, which: FloatArray | IntArray) -> Views:
-        """Return those of some points."""
-        return Views(self.rows[which], self.centres[which], self.first[which], self.counts[which])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -50,45 +33,43 @@ class Points:
 
 def triangulate(views: Views) -> Points:
     """Return the points that fit their views best, by Gauss and Newton from the best distance on the first ray."""
-    to_first = views.centres[:, :1] - views.centres  # (F, M, 3)
-    direction = views.first
-    across = _across(direction)
-    along = np.einsum("fmij,fmj->fmi", views.rows, to_first)
-    ahead = np.einsum("fmij,fj->fmi", views.rows, direction)
-    inverse = -(along * ahead).sum((1, 2)) / np.maximum((along**2).sum((1, 2)), 1e-12)
-    inverse = np.maximum(inverse, _LEAST_INVERSE)
+    direction, inverse = views.first, _first_inverse(views)
     for _ in range(_STEPS):
-        residuals, gains = _linearized(views, direction, inverse, to_first)
-        jacobian = np.concatenate(
-            [gains @ across[:, None], (gains @ to_first[..., None])], axis=3
-        )  # (F, M, 2, 3) by two angles and the inverse distance
-        N = np.einsum("fmia,fmib->fab", jacobian, jacobian) + 1e-9 * np.eye(3)
+        positions, axes = _placed(views, direction, inverse)
+        residuals, N, jacobian = _normal(views, positions, axes)
         step = np.linalg.solve(N, -np.einsum("fmia,fmi->fa", jacobian, residuals)[..., None])
-        direction = direction + (across @ step[:, :2])[..., 0]
-        inverse = np.maximum(inverse + step[:, 2, 0], _LEAST_INVERSE)
-    residuals, gains = _linearized(views, direction, inverse, to_first)
-    length = np.linalg.norm(direction, axis=1)
-    distance = length / inverse
-    positions = views.centres[:, 0] + direction / inverse[:, None]
-    axes = np.concatenate(
-        [across * distance[:, None, None], (direction * (distance / inverse)[:, None])[..., None]],
-        axis=2,
-    )
-    jacobian = np.concatenate([gains @ across[:, None], gains @ to_first[..., None]], axis=3)
-    N = np.einsum("fmia,fmib->fab", jacobian, jacobian) + 1e-9 * np.eye(3)
-    sigmas = np.sqrt(np.linalg.inv(N)[:, 2, 2]) / length
-    return Points(
-        positions, inverse / length, sigmas, axes, (residuals**2).sum((1, 2)), views.counts
-    )
+        direction = direction + (axes[:, :, :2] @ step[:, :2])[..., 0] * inverse[:, None]
+        direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+        inverse = np.maximum(inverse - step[:, 2, 0], _LEAST_INVERSE)
+    positions, axes = _placed(views, direction, inverse)
+    residuals, N, _ = _normal(views, positions, axes)
+    sigmas = np.sqrt(np.linalg.inv(N)[:, 2, 2])
+    return Points(positions, inverse, sigmas, axes, (residuals**2).sum((1, 2)), views.counts)
 
 
 def gains_at(views: Views, positions: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return residuals (F, M, 2) of points (F, 3), and how they change with the points (F, M, 2, 3)."""
-    return _gains(views.rows, positions[:, None] - views.centres)
+    """Return residuals (F, M, 2) of points (F, 3), and how they change with the points (F, M, 2, 3).
+
+    Where distances were measured there is a third row.
+    """
+    seen = positions[:, None] - views.centres
+    length = np.maximum(np.linalg.norm(seen, axis=-1), 1e-9)
+    unit = seen / length[..., None]
+    residuals = np.einsum("...ij,...j->...i", views.rows, unit)
+    gains = (views.rows - residuals[..., None] * unit[..., None, :]) / length[..., None, None]
+    if views.distances is None or views.distance_weights is None:
+        return residuals, gains
+    weights = views.distance_weights
+    farther = (length - views.distances) * weights
+    along = (unit * weights[..., None])[..., None, :]
+    return (
+        np.concatenate([residuals, farther[..., None]], axis=-1),
+        np.concatenate([gains, along], axis=-2),
+    )
 
 
 def by_pose(gains: FloatArray, positions: FloatArray) -> FloatArray:
-    """Return how residuals change with the poses of their views, (..., 2, 6), rotation first.
+    """Return how residuals change with the poses of their views, (..., 6), rotation first.
 
     The poses are perturbed on the left, in the world: T = exp(xi) T_estimate.
     """
@@ -96,20 +77,35 @@ def by_pose(gains: FloatArray, positions: FloatArray) -> FloatArray:
     return np.concatenate([turned, -gains], axis=-1)
 
 
-def _linearized(
-    views: Views, direction: FloatArray, inverse: FloatArray, to_first: FloatArray
+def _first_inverse(views: Views) -> FloatArray:
+    """Return the inverse distance (F,) along the first ray: measured there, or best for the other rays."""
+    to_first = views.centres[:, :1] - views.centres  # (F, M, 3)
+    along = np.einsum("fmij,fmj->fmi", views.rows, to_first)
+    ahead = np.einsum("fmij,fj->fmi", views.rows, views.first)
+    inverse = -(along * ahead).sum((1, 2)) / np.maximum((along**2).sum((1, 2)), 1e-12)
+    if views.distances is not None and views.distance_weights is not None:
+        measured = views.distance_weights[:, 0] > 0
+        inverse = np.where(measured, 1 / np.maximum(views.distances[:, 0], 1e-3), inverse)
+    return np.asarray(np.maximum(inverse, _LEAST_INVERSE))
+
+
+def _placed(
+    views: Views, direction: FloatArray, inverse: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Return residuals, and their derivatives by the direction and by the inverse distance times `to_first`."""
-    seen = direction[:, None] + inverse[:, None, None] * to_first
-    return _gains(views.rows, seen)
+    """Return positions (F, 3), and the steps (F, 3, 3) of two angles and the inverse distance."""
+    away = direction / inverse[:, None]
+    across = _across(direction) / inverse[:, None, None]
+    along = (away / inverse[:, None])[..., None]
+    return views.centres[:, 0] + away, np.concatenate([across, along], axis=2)
 
 
-def _gains(rows: FloatArray, seen: FloatArray) -> tuple[FloatArray, FloatArray]:
-    length = np.maximum(np.linalg.norm(seen, axis=-1), 1e-9)
-    unit = seen / length[..., None]
-    residuals = np.einsum("...ij,...j->...i", rows, unit)
-    gains = (rows - residuals[..., None] * unit[..., None, :]) / length[..., None, None]
-    return residuals, gains
+def _normal(
+    views: Views, positions: FloatArray, axes: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    residuals, gains = gains_at(views, positions)
+    jacobian = gains @ axes[:, None]
+    N = np.einsum("fmia,fmib->fab", jacobian, jacobian) + 1e-9 * np.eye(3)
+    return residuals, N, jacobian
 
 
 def _across(direction: FloatArray) -> FloatArray:

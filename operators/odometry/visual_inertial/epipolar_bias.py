@@ -12,8 +12,8 @@ from itertools import combinations
 
 import numpy as np
 
+from mapstream.operators.odometry.visual.sightings import Sightings
 from mapstream.operators.odometry.visual_inertial.integration import Integration
-from mapstream.operators.odometry.visual_inertial.window import Sightings
 from mapstream.streams.arrays import FloatArray
 
 _LEAST_COMMON = 8  # points in two images that make a pair
@@ -26,7 +26,7 @@ def epipolar_bias(sightings: Sightings, integration: Integration, sigma_radps: f
     """Return the bias (3,) that makes epipolar planes meet.
 
     Args:
-        sightings: Of K images, whose clone ids are 0 to K - 1.
+        sightings: Of K images, whose numbers are 0 to K - 1.
         integration: Between the images.
         sigma_radps: How far from zero it is likely to be.
     """
@@ -52,7 +52,7 @@ def _pairs(sightings: Sightings, num_images: int) -> list[_Pair]:
     pairs: list[_Pair] = []
     for number in np.unique(camera):
         seen = sightings.chosen(camera.ravel() == number)
-        images = [seen.chosen(seen.clone_ids == k) for k in range(num_images)]
+        images = [seen.chosen(seen.images == k) for k in range(num_images)]
         for a, b in combinations(range(num_images), 2):
             _, i, j = np.intersect1d(images[a].keys, images[b].keys, return_indices=True)
             if len(i) >= _LEAST_COMMON:

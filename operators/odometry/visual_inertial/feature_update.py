@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from mapstream.operators.odometry.visual.sightings import Grouped
 from mapstream.operators.odometry.visual.triangulation import (
     Points,
     by_pose,
@@ -19,7 +20,6 @@ from mapstream.operators.odometry.visual.triangulation import (
     triangulate,
 )
 from mapstream.operators.odometry.visual_inertial.state import NUM_INERTIAL, FilterState
-from mapstream.operators.odometry.visual_inertial.window import Grouped
 from mapstream.streams.arrays import FloatArray, IntArray
 
 BoolArray = npt.NDArray[np.bool_]
@@ -49,20 +49,20 @@ def constraints(group: Grouped, state: FilterState) -> Constraints:
     residuals, gains = gains_at(group.views, points.positions)
     by_clone = by_pose(gains, points.positions[:, None])
     num_clones = len(state.clone_ids)
-    num, most = group.clones.shape
-    spread = np.zeros((num, most, 2, num_clones, 6))
-    f, m = np.nonzero(group.clones >= 0)
-    spread[f, m, :, group.clones[f, m]] = by_clone[f, m]
-    H = spread.reshape(num, 2 * most, 6 * num_clones)
-    of_point = (gains @ points.axes[:, None]).reshape(num, 2 * most, 3)
-    r = -residuals.reshape(num, 2 * most)
+    (num, most), size = group.images.shape, residuals.shape[2]
+    spread = np.zeros((num, most, size, num_clones, 6))
+    f, m = np.nonzero(group.images >= 0)
+    spread[f, m, :, group.images[f, m]] = by_clone[f, m]
+    H = spread.reshape(num, size * most, 6 * num_clones)
+    of_point = (gains @ points.axes[:, None]).reshape(num, size * most, 3)
+    r = -residuals.reshape(num, size * most)
     Pt = np.swapaxes(of_point, 1, 2)
     C = np.linalg.inv(Pt @ of_point + 1e-9 * np.eye(3))
     follow = -C @ (Pt @ H)
     shift = (C @ (Pt @ r[..., None]))[..., 0]
     left_H = H + of_point @ follow  # what no shift of the point explains
     left_r = r - (of_point @ shift[..., None])[..., 0]
-    accepted = _believed(state, left_H, left_r, 2 * group.views.counts - 3)
+    accepted = _believed(state, left_H, left_r, group.views.freedom)
     accepted &= _seen_ahead(group, points.positions)
     axes = points.axes
     return Constraints(

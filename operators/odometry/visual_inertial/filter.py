@@ -12,6 +12,7 @@ import numpy as np
 
 from mapstream.operators.imu.parameters import ImuQuality
 from mapstream.operators.odometry.visual.rays import Rays
+from mapstream.operators.odometry.visual.sightings import Sightings, grouped
 from mapstream.operators.odometry.visual_inertial.feature_update import Constraints, constraints
 from mapstream.operators.odometry.visual_inertial.point_update import (
     PointUpdate,
@@ -27,7 +28,7 @@ from mapstream.operators.odometry.visual_inertial.state import (
     compressed,
     update,
 )
-from mapstream.operators.odometry.visual_inertial.window import Sightings, complete, grouped
+from mapstream.operators.odometry.visual_inertial.window import complete
 from mapstream.streams.arrays import FloatArray, IntArray
 from mapstream.streams.geometry import SE3, invert
 
@@ -105,9 +106,9 @@ class Filter:
         is_full = len(state.clone_ids) >= limits.num_clones
         oldest_id = state.clone_ids[0] if is_full else None
         chosen, spent = complete(self._sightings, keys_now, oldest_id, limits.num_tracks)
-        found = constraints(
-            grouped(self._sightings.chosen(np.isin(self._sightings.keys, chosen)), state), state
-        )
+        used = self._sightings.chosen(np.isin(self._sightings.keys, chosen))
+        group = grouped(used, state.clone_ids, state.clone_R, state.clone_p)
+        found = constraints(group, state)
         known = point_update(of_points, state)
         correction = _update(state, found, known)
         state.forget_points(known.refused)
@@ -127,7 +128,7 @@ class Filter:
             gone = np.append(gone, self._standing_clone)
         self._standing_clone = clone_id if is_standing else None
         state.forget_clones(gone)
-        kept = ~np.isin(self._sightings.clone_ids, gone)
+        kept = ~np.isin(self._sightings.images, gone)
         self._sightings = self._sightings.chosen(kept)
 
 

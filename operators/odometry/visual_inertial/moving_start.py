@@ -14,11 +14,16 @@ import numpy as np
 
 from mapstream.operators.imu.parameters import ImuQuality
 from mapstream.operators.imu.samples import level_attitude
+from mapstream.operators.odometry.visual.sightings import (
+    BoolArray,
+    Grouped,
+    Sightings,
+    grouped,
+)
 from mapstream.operators.odometry.visual_inertial.epipolar_bias import epipolar_bias
 from mapstream.operators.odometry.visual_inertial.feature_update import constraints
 from mapstream.operators.odometry.visual_inertial.integration import Integrated, Integration
 from mapstream.operators.odometry.visual_inertial.state import NUM_INERTIAL, FilterState
-from mapstream.operators.odometry.visual_inertial.window import BoolArray, Sightings, grouped
 from mapstream.streams.arrays import FloatArray
 from mapstream.streams.geometry import hat, so3_log
 
@@ -79,7 +84,7 @@ def start_in_motion(
     """Return the state at the first image; None if tracks and motion do not tell it well.
 
     Args:
-        sightings: Of K images, whose clone ids are 0 to K - 1.
+        sightings: Of K images, whose numbers are 0 to K - 1.
         integration: Samples from the first image to the last.
         imu: Its noise.
         stamp_ns: Of the first image.
@@ -105,11 +110,11 @@ def _linear(
     down = -integration.mean_force / np.linalg.norm(integration.mean_force)
     start = _Start(gyro_bias, np.zeros(3), np.zeros(3), down)
     guess = integration.integrated(gyro_bias[None], np.zeros((1, 3)))
-    group = grouped(sightings, _clones(guess.R[0], guess.p[0]))
+    group = _grouped(sightings, _clones(guess.R[0], guess.p[0]))
     rows, centres = group.views.rows, group.views.centres
     times = (
-        guess.times_s[np.maximum(group.clones, 0)][..., None, None]
-        * (group.clones >= 0)[..., None, None]
+        guess.times_s[np.maximum(group.images, 0)][..., None, None]
+        * (group.images >= 0)[..., None, None]
     )
     by_speed = np.concatenate([times * np.eye(3), times**2 / 2 * np.eye(3)], axis=-1)
     squares = np.swapaxes(rows, -1, -2) @ rows  # (F, M, 3, 3)
@@ -163,9 +168,12 @@ def _fit(
 ) -> _Fit:
     guess = _around(integration, start)
     poses = _poses(guess, start, imu)
-    found = constraints(grouped(sightings, poses), poses)
+    group = _grouped(sightings, poses)
+    found = constraints(group, poses)
     J = _by_start(guess, poses, start, imu)
-    excess = found.points.cost / (2 * found.points.counts - 3)  # about 1 for a track without fault
+    excess = found.points.cost / np.maximum(
+        group.views.freedom, 1
+    )  # about 1 for a track without fault
     w = 1 / (1 + excess / _FAULT)
     information = np.einsum("f,fij->ij", w, found.information)
     vector = w @ found.vector
@@ -194,6 +202,10 @@ def _poses(guess: Integrated, start: _Start, imu: ImuQuality) -> FilterState:
     times = guess.times_s[:, None]
     fall = imu.gravity_mps2 * start.down
     return _clones(guess.R[0], guess.p[0] + start.velocity * times + fall * times**2 / 2)
+
+
+def _grouped(sightings: Sightings, poses: FilterState) -> Grouped:
+    return grouped(sightings, poses.clone_ids, poses.clone_R, poses.clone_p)
 
 
 def _clones(R: FloatArray, p: FloatArray) -> FilterState:

@@ -12,10 +12,10 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from mapstream.operators.odometry.visual.sightings import Sightings, grouped
 from mapstream.operators.odometry.visual.triangulation import by_pose, gains_at
 from mapstream.operators.odometry.visual_inertial.feature_update import Constraints, chi2_limit
 from mapstream.operators.odometry.visual_inertial.state import NUM_INERTIAL, FilterState
-from mapstream.operators.odometry.visual_inertial.window import Sightings, grouped
 from mapstream.streams.arrays import FloatArray, IntArray
 
 BoolArray = npt.NDArray[np.bool_]
@@ -41,20 +41,20 @@ def point_update(sightings: Sightings, state: FilterState) -> PointUpdate:
     information, vector = np.zeros((len(columns),) * 2), np.zeros(len(columns))
     if len(sightings) == 0:
         return PointUpdate(columns, information, vector, refused)
-    group = grouped(sightings, state)
+    group = grouped(sightings, state.clone_ids, state.clone_R, state.clone_p)
     by_key = np.argsort(state.keys)
     rows = by_key[np.searchsorted(state.keys, group.keys, sorter=by_key)]
     residuals, gains = gains_at(group.views, state.points[rows])
     by_clone = by_pose(gains, state.first_points[rows][:, None])
-    num, most = group.clones.shape
-    H = np.concatenate([by_clone, gains], axis=3).reshape(num, 2 * most, 9)
-    r = -residuals.reshape(num, 2 * most)
+    (num, most), size = group.images.shape, residuals.shape[2]
+    H = np.concatenate([by_clone, gains], axis=3).reshape(num, size * most, 9)
+    r = -residuals.reshape(num, size * most)
     own = np.arange(3) + first + 3 * rows[:, None]
     at = np.concatenate([np.tile(np.arange(pose.start, pose.stop), (num, 1)), own], axis=1)
     P = state.covariance[at[:, :, None], at[:, None, :]]
-    S = H @ P @ np.swapaxes(H, 1, 2) + np.eye(2 * most)
+    S = H @ P @ np.swapaxes(H, 1, 2) + np.eye(size * most)
     distance = np.einsum("fi,fi->f", r, np.linalg.solve(S, r[..., None])[..., 0])
-    good = distance < chi2_limit(2 * group.views.counts)
+    good = distance < chi2_limit(group.views.freedom + 3)
     refused[rows[~good]] = True
     for k in np.flatnonzero(good):
         place = np.r_[0:6, 6 + 3 * rows[k] : 9 + 3 * rows[k]]

@@ -8,12 +8,12 @@ import numpy as np
 
 from mapstream.operators.imu.parameters import ImuQuality
 from mapstream.operators.odometry.visual.rays import Rays
+from mapstream.operators.odometry.visual.sightings import Sightings
 from mapstream.operators.odometry.visual_inertial.integration import Integration
 from mapstream.operators.odometry.visual_inertial.moving_start import start_in_motion
 from mapstream.operators.odometry.visual_inertial.resting_start import Held, start_at_rest
 from mapstream.operators.odometry.visual_inertial.samples import ImuSamples
 from mapstream.operators.odometry.visual_inertial.state import FilterState
-from mapstream.operators.odometry.visual_inertial.window import Sightings
 
 _NUM_IMAGES = 10  # that a start in motion looks at
 _LEAST_S, _EVERY_S = 1.0, 0.25  # of motion before the first try, and between tries
