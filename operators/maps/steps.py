@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from importlib import import_module
 from typing import Any, ClassVar, get_type_hints
 
@@ -17,12 +18,18 @@ from mapstream.recordings.maps.combine import with_journal_entry
 from mapstream.recordings.maps.model import Map
 from mapstream.streams.channel import Receiver, Sender
 
-Tool = Callable[[Map, Any], tuple[Map, Any]]
-"""From a map and the tool's config to a new map and a report."""
+Tool = Callable[[Map], tuple[Map, Any]]
+"""From a map to a new map and a report."""
 
 TOOLS = {
+    "create_landmarks": "mapstream.operators.landmarks.create:create_landmarks",
+    "evaluate_quality": "mapstream.operators.landmarks.quality:evaluate_quality",
     "fix_stationary": "mapstream.operators.maps.stationary:fix_stationary",
     "optimize": "mapstream.operators.estimation.batch:optimize_map",
+    "remove_bad_landmarks": "mapstream.operators.landmarks.removal:remove_bad_landmarks",
+    "remove_invalid_observations": "mapstream.operators.landmarks.removal:remove_invalid_observations",
+    "reset_quality": "mapstream.operators.landmarks.quality:reset_quality",
+    "retriangulate": "mapstream.operators.landmarks.create:retriangulate",
 }
 """By the name that graph files use; what is imported is imported when a graph uses it."""
 
@@ -75,7 +82,7 @@ class MapSteps(Operator[Inputs, Outputs]):
     spans_epochs: ClassVar[bool] = True
 
     def __init__(self, config: MapStepsConfig) -> None:
-        self._steps = [(step, *prepared(step)) for step in config.steps]
+        self._steps = [(step, prepared(step)) for step in config.steps]
 
     async def run(self, inputs: Inputs, outputs: Outputs) -> None:
         async for map_ in inputs.maps:
@@ -87,23 +94,24 @@ class MapSteps(Operator[Inputs, Outputs]):
         Raises:
             MappingError: If a tool refuses the map.
         """
-        for step, tool, config in self._steps:
-            map_, _ = tool(map_, config)
+        for step, tool in self._steps:
+            map_, _ = tool(map_)
             map_ = with_journal_entry(map_, step.tool, **step.config)
         return map_
 
 
-def prepared(step: MapStep) -> tuple[Tool, BaseModel]:
-    """Return the function behind a step, and its options.
+def prepared(step: MapStep) -> Tool:
+    """Return the tool of a step with its options.
 
     Raises:
         ValidationError: If an option is not one.
     """
     module, _, name = TOOLS[step.tool].partition(":")
     tool = getattr(import_module(module), name)
-    hint = get_type_hints(tool)["config"]
+    hint = get_type_hints(tool).get("config", OperatorConfig)
     config_type = next(t for t in (hint, *getattr(hint, "__args__", ())) if _is_config(t))
-    return tool, config_type.model_validate(step.config)
+    config = config_type.model_validate(step.config)
+    return partial(tool, config=config) if hint is not OperatorConfig else tool
 
 
 def _is_config(found: object) -> bool:
