@@ -1,7 +1,6 @@
 """Tracks that have ended, or fill the window: they constrain the clones, and are not kept.
 
-The point is estimated from all its views and then eliminated (the projection on its left null space, in
-information form); what remains is a constraint between the poses alone.
+The point is estimated from all its views and then eliminated; what remains is a constraint between the poses.
 Source: Mourikis and Roumeliotis, A Multi-State Constraint Kalman Filter, ICRA 2007, section III-D.
 """
 
@@ -12,13 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from mapstream.operators.odometry.visual.elimination import Eliminated, eliminate
 from mapstream.operators.odometry.visual.sightings import Grouped
-from mapstream.operators.odometry.visual.triangulation import (
-    Points,
-    by_pose,
-    gains_at,
-    triangulate,
-)
 from mapstream.operators.odometry.visual_inertial.state import NUM_INERTIAL, FilterState
 from mapstream.streams.arrays import FloatArray, IntArray
 
@@ -27,59 +21,28 @@ BoolArray = npt.NDArray[np.bool_]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Constraints:
-    """What F points say of K clones, C = 6 K columns, and of themselves."""
+    """What F points say of K clones, and which are believed."""
 
     keys: IntArray  # (F,)
-    points: Points
-    information: FloatArray  # (F, C, C) H^T H without the point
-    vector: FloatArray  # (F, C) H^T r without the point
+    found: Eliminated
     accepted: BoolArray  # (F,)
-    point_by_state: FloatArray  # (F, 3, C) how the points' errors follow those of the clones
-    point_covariance: FloatArray  # (F, 3, 3) of the points, were the clones exact
-    point_shift: FloatArray  # (F, 3) from where they were triangulated to where they fit best
 
     @property
     def total(self) -> tuple[FloatArray, FloatArray]:
-        return self.information[self.accepted].sum(0), self.vector[self.accepted].sum(0)
+        """Return H^T H (C, C) and H^T r (C,) of those that are believed."""
+        H = self.found.H[self.accepted].reshape(-1, self.found.H.shape[2])
+        return H.T @ H, H.T @ self.found.residuals[self.accepted].ravel()
 
 
 def constraints(group: Grouped, state: FilterState) -> Constraints:
-    """Return what points say of the clones, those that contradict the state marked as refused."""
-    points = triangulate(group.views)
-    residuals, gains = gains_at(group.views, points.positions)
-    by_clone = by_pose(gains, points.positions[:, None])
-    num_clones = len(state.clone_ids)
-    (num, most), size = group.images.shape, residuals.shape[2]
-    spread = np.zeros((num, most, size, num_clones, 6))
-    f, m = np.nonzero(group.images >= 0)
-    spread[f, m, :, group.images[f, m]] = by_clone[f, m]
-    H = spread.reshape(num, size * most, 6 * num_clones)
-    of_point = (gains @ points.axes[:, None]).reshape(num, size * most, 3)
-    r = -residuals.reshape(num, size * most)
-    Pt = np.swapaxes(of_point, 1, 2)
-    C = np.linalg.inv(Pt @ of_point + 1e-9 * np.eye(3))
-    follow = -C @ (Pt @ H)
-    shift = (C @ (Pt @ r[..., None]))[..., 0]
-    left_H = H + of_point @ follow  # what no shift of the point explains
-    left_r = r - (of_point @ shift[..., None])[..., 0]
-    accepted = _believed(state, left_H, left_r, group.views.freedom)
-    accepted &= _seen_ahead(group, points.positions)
-    axes = points.axes
-    return Constraints(
-        group.keys,
-        points,
-        np.swapaxes(left_H, 1, 2) @ left_H,
-        np.einsum("fij,fi->fj", left_H, left_r),
-        accepted,
-        axes @ follow,
-        axes @ C @ np.swapaxes(axes, 1, 2),
-        (axes @ shift[..., None])[..., 0],
-    )
+    """Return what points say of the clones; those that contradict the state are not believed."""
+    found = eliminate(group, len(state.clone_ids))
+    accepted = _fits(state, found.H, found.residuals, group.views.freedom)
+    accepted &= _seen_ahead(group, found.points.positions)
+    return Constraints(group.keys, found, accepted)
 
 
-def _believed(
-    state: FilterState, H: FloatArray, residuals: FloatArray, freedom: IntArray
-) -> BoolArray:
+def _fits(state: FilterState, H: FloatArray, residuals: FloatArray, freedom: IntArray) -> BoolArray:
     """Return which residuals (F, M) are as small as their covariance says (Mahalanobis, 95 %)."""
     at = slice(NUM_INERTIAL, state.first_point_column)
     S = H @ state.covariance[at, at] @ np.swapaxes(H, 1, 2) + np.eye(H.shape[1])

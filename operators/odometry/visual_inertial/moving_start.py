@@ -14,6 +14,7 @@ import numpy as np
 
 from mapstream.operators.imu.parameters import ImuQuality
 from mapstream.operators.imu.samples import level_attitude
+from mapstream.operators.odometry.visual.elimination import eliminate
 from mapstream.operators.odometry.visual.sightings import (
     BoolArray,
     Grouped,
@@ -21,7 +22,6 @@ from mapstream.operators.odometry.visual.sightings import (
     grouped,
 )
 from mapstream.operators.odometry.visual_inertial.epipolar_bias import epipolar_bias
-from mapstream.operators.odometry.visual_inertial.feature_update import constraints
 from mapstream.operators.odometry.visual_inertial.integration import Integrated, Integration
 from mapstream.operators.odometry.visual_inertial.state import NUM_INERTIAL, FilterState
 from mapstream.streams.arrays import FloatArray
@@ -169,14 +169,14 @@ def _fit(
     guess = _around(integration, start)
     poses = _poses(guess, start, imu)
     group = _grouped(sightings, poses)
-    found = constraints(group, poses)
+    found = eliminate(group, len(poses.clone_ids))
     J = _by_start(guess, poses, start, imu)
     excess = found.points.cost / np.maximum(
         group.views.freedom, 1
     )  # about 1 for a track without fault
     w = 1 / (1 + excess / _FAULT)
-    information = np.einsum("f,fij->ij", w, found.information)
-    vector = w @ found.vector
+    of_poses, towards = found.information()
+    information, vector = np.einsum("f,fij->ij", w, of_poses), w @ towards
     away = np.concatenate([start.gyro_bias, start.accel_bias, np.zeros(5)])
     return _Fit(
         start,

@@ -76,13 +76,16 @@ def begin_points(
     """
     clones = slice(NUM_INERTIAL, state.first_point_column)
     for k in np.flatnonzero(wanted):
-        follow = found.point_by_state[k]
+        follow = found.found.point_by_poses[k]
         by_state = np.zeros((3, len(state.covariance)))
         by_state[:, clones] = follow
-        position = found.points.positions[k] + found.point_shift[k] + follow @ correction
-        state.add_point(int(found.keys[k]), position, by_state, found.point_covariance[k])
+        position = (
+            found.found.points.positions[k] + found.found.point_shift[k] + follow @ correction
+        )
+        state.add_point(int(found.keys[k]), position, by_state, found.found.point_covariance[k])
 
 
 def is_certain(found: Constraints) -> BoolArray:
     """Return which points (F,) have distances that are certain enough to be kept."""
-    return np.asarray(found.points.sigmas < _MOST_RELATIVE_SIGMA * found.points.inverse_distances)
+    points = found.found.points
+    return np.asarray(points.sigmas < _MOST_RELATIVE_SIGMA * points.inverse_distances)
