@@ -38,9 +38,11 @@ BUILT_IN = {
     "image_decode": "mapstream.operators.decode.image:ImageDecode",
     "imu_biases": "mapstream.operators.imu.biases:ImuBiases",
     "keyframes": "mapstream.operators.submaps.keyframes:Keyframes",
+    "keypoint_depth": "mapstream.operators.tracking.keypoint_depth:KeypointDepth",
     "kiss_odometry": "mapstream.operators.odometry.kiss_odometry:KissOdometry",
     "klt": "mapstream.operators.tracking.klt:Klt",
     "lidar_loops": "mapstream.operators.lidar.loops:LidarLoops",
+    "localize": "mapstream.operators.places.localize:Localize",
     "map_steps": "mapstream.operators.maps.steps:MapSteps",
     "map_store": "mapstream.operators.sinks.map_store:MapStore",
     "mcap": "mapstream.operators.sources.mcap:McapSource",
@@ -61,6 +63,7 @@ BUILT_IN = {
     "trajectory_sink": "mapstream.operators.sinks.trajectory:TrajectorySink",
     "undistort": "mapstream.operators.images.undistort:Undistort",
     "visual_inertial_odometry": "mapstream.operators.odometry.visual_inertial.visual_inertial_odometry:VisualInertialOdometry",
+    "visual_odometry": "mapstream.operators.odometry.visual.visual_odometry:VisualOdometry",
     "xfeat": "mapstream.operators.networks.xfeat:XFeat",
 }
 

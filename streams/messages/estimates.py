@@ -163,3 +163,19 @@ class MapCorrection:
     def __post_init__(self) -> None:
         n = frozen(self, "stamps_ns", np.int64, (None,)).shape[0]
         frozen(self, "T_mission_base", np.float64, (n, 4, 4))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class MapPose:
+    """Where the robot is in a map that is finished, by its odometry and by what it recognises of the map."""
+
+    stamp_ns: int
+    state: Literal["lost", "tracking", "recovered"]  # recovered: this pose ends a time of being lost
+    T_map_base: SE3 | None = None  # None while lost
+    T_map_odom: SE3 | None = None  # carries the odometry into the map
+    covariance: FloatArray | None = None  # (6, 6) of T_map_base
+    num_inliers: int = 0  # of the frame of this stamp, if one was compared with the map
+    verdict: str = ""  # on that frame: accepted, or why not
+
+    def __post_init__(self) -> None:
+        frozen_optional(self, "covariance", np.float64, (6, 6))

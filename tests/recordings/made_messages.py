@@ -18,6 +18,7 @@ from mapstream.streams.messages.estimates import (
     LoopCandidate,
     LoopReport,
     MapCorrection,
+    MapPose,
     Odometry,
     PointCloud,
     RelativePose,
@@ -155,6 +156,10 @@ def one_of_each(seed: int) -> list[Any]:
         LoopReport(
             stamp_ns=stamp, edges=(edge,) * n,
             candidates=(LoopCandidate(stamp_a_ns=1, stamp_b_ns=2, distance_m=3.0, verdict="accepted"),),
+        ),
+        MapPose(
+            stamp_ns=stamp, state="tracking", T_map_base=maybe(pose()), T_map_odom=maybe(pose()),
+            covariance=maybe(covariance()), num_inliers=n, verdict="accepted",
         ),
         MapCorrection(
             stamp_ns=stamp, mission_id=mission, stamps_ns=np.arange(n),

@@ -87,11 +87,11 @@ def see(
     )
 
 
-def drifted(truth: list[SE3]) -> list[SE3]:
+def drifted(truth: list[SE3], scale: float = 1.0) -> list[SE3]:
     """The same motion as an odometry measures it, from the same start."""
     poses = [truth[0]]
     for a, b in pairwise(truth):
-        poses.append(poses[-1] @ a.inverse() @ b @ SE3(se3_exp(_DRIFT)))
+        poses.append(poses[-1] @ a.inverse() @ b @ SE3(se3_exp(scale * _DRIFT)))
     return poses
 
 
@@ -103,13 +103,14 @@ def flown(
     sensors: dict[str, Sensor],
     *,
     from_origin: bool = False,
+    drift: float = 1.0,
     kinds: tuple[tuple[str, Room], ...] = (),
 ) -> Map:
     """Add a mission along these poses; points get new tracks with each lap.
 
     `from_origin`: its frame is that of its first pose, as an odometry's is; otherwise it is the room's.
     """
-    poses = drifted(truth)
+    poses = drifted(truth, drift)
     if from_origin:
         poses = [truth[0].inverse() @ pose for pose in poses]
     keyframes, edges = [], []

@@ -1,0 +1,162 @@
+"""Where a robot is in a map that was made before, while it drives."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import ClassVar
+
+from pydantic import Field, NonNegativeFloat
+
+from mapstream.operators.operator import Operator, OperatorConfig, Placement, offload, warn
+from mapstream.operators.places.drift import Drift, DriftConfig, Fix
+from mapstream.operators.places.map_places import MapPlaces
+from mapstream.operators.places.recognition import Recognition, RecognitionConfig
+from mapstream.operators.places.views import view_of
+from mapstream.recordings.maps import load_map
+from mapstream.streams.channel import Receiver, Sender
+from mapstream.streams.geometry import SE3
+from mapstream.streams.messages.estimates import MapPose, Odometry
+from mapstream.streams.messages.vision import NFrame
+from mapstream.streams.sync import merge
+
+
+class LocalizeConfig(OperatorConfig):
+    """Options of `localize`."""
+
+    map: Path
+    """The folder of the map, or of its summary."""
+    period_s: NonNegativeFloat = 0.5
+    """Between two frames that are compared with the map; 0: all are."""
+    recognition: RecognitionConfig = Field(default_factory=RecognitionConfig)
+    drift: DriftConfig = Field(default_factory=DriftConfig)
+
+
+@dataclass(frozen=True)
+class Inputs:
+    """What cameras see, and how the robot moves between; without odometry each frame stands alone."""
+
+    n_frames: Receiver[NFrame]
+    odometry: Receiver[Odometry] | None = None
+
+
+@dataclass(frozen=True)
+class Outputs:
+    """One pose for each odometry; without odometry, one for each frame that is compared."""
+
+    poses: Sender[MapPose]
+    odometry: Sender[Odometry]  # the poses in the map alone, where the robot is not lost
+
+
+class Localize(Operator[Inputs, Outputs]):
+    """Recognise places of a map, and hold the odometry there: poses do not drift, and the map does not grow.
+
+    The robot is lost until some frames agree with each other on where it is, and again when it was carried
+    elsewhere or has recognised nothing for too long. `recovered` is the first pose after that.
+    """
+
+    placement: ClassVar[Placement] = "thread"
+
+    def __init__(self, config: LocalizeConfig) -> None:
+        self._config = config
+        self._drift = Drift(config.drift)
+        self._places: MapPlaces | None = None
+        self._before: Odometry | None = None
+        self._compared_ns: int | None = None
+        self._waiting: list[NFrame] = []  # for the odometry of their time
+        self._has_tracked = self._was_tracking = False
+
+    async def run(self, inputs: Inputs, outputs: Outputs) -> None:
+        self._places = await offload(self._opened)
+        if inputs.odometry is None:
+            async for frame in inputs.n_frames:
+                if self._is_due(frame):
+                    await self._send(outputs, await offload(self.locate, frame))
+            return
+        async for _, message in merge(inputs.odometry, inputs.n_frames):
+            if isinstance(message, Odometry):
+                await self._send(outputs, await offload(self.follow, message))
+            elif self._is_due(message):
+                self._waiting.append(message)
+        if not self._has_tracked:
+            warn("the robot was never found in the map")
+
+    def _opened(self) -> MapPlaces:
+        return MapPlaces(load_map(self._config.map), self._config.recognition)
+
+    def _is_due(self, frame: NFrame) -> bool:
+        since_s = self._config.period_s
+        if self._compared_ns is not None and frame.stamp_ns - self._compared_ns < since_s * 1e9:
+            return False
+        self._compared_ns = frame.stamp_ns
+        return True
+
+    async def _send(self, outputs: Outputs, pose: MapPose) -> None:
+        await outputs.poses.send(pose)
+        if pose.T_map_base is not None:
+            await outputs.odometry.send(
+                Odometry(stamp_ns=pose.stamp_ns, T_odom_base=pose.T_map_base)
+            )
+        else:
+            outputs.odometry.advance(pose.stamp_ns)
+
+    def locate(self, frame: NFrame) -> MapPose:
+        """Return where one frame was taken, by itself."""
+        recognition = self._recognition(frame)
+        found = recognition.found
+        if found is None:
+            return MapPose(stamp_ns=frame.stamp_ns, state="lost", verdict=recognition.reason)
+        return MapPose(
+            stamp_ns=frame.stamp_ns,
+            state="tracking",
+            T_map_base=found.consensus.pose.T_map_base,
+            covariance=found.consensus.pose.covariance,
+            num_inliers=len(found.inliers),
+            verdict=recognition.reason,
+        )
+
+    def follow(self, odometry: Odometry) -> MapPose:
+        """Return where the robot is at this moment of its odometry, after the frames until then."""
+        before = self._before or odometry
+        self._drift.move(odometry.T_odom_base)
+        num_inliers, verdict = 0, ""
+        for frame in self._waiting:
+            recognition = self._recognition(frame)
+            verdict = recognition.reason
+            if recognition.found is not None:
+                num_inliers = len(recognition.found.inliers)
+                pose = recognition.found.consensus.pose
+                T_odom_base = _between(before, odometry, frame.stamp_ns)
+                fix = Fix(frame.stamp_ns, pose.T_map_base, pose.covariance, T_odom_base)
+                self._drift.correct(fix)
+        self._waiting.clear()
+        self._before = odometry
+        T_map_odom = self._drift.T_map_odom(odometry.stamp_ns)
+        is_back = T_map_odom is not None and self._has_tracked and not self._was_tracking
+        self._was_tracking = T_map_odom is not None
+        self._has_tracked |= self._was_tracking
+        if T_map_odom is None:
+            return MapPose(
+                stamp_ns=odometry.stamp_ns, state="lost", num_inliers=num_inliers, verdict=verdict
+            )
+        return MapPose(
+            stamp_ns=odometry.stamp_ns,
+            state="recovered" if is_back else "tracking",
+            T_map_base=T_map_odom @ odometry.T_odom_base,
+            T_map_odom=T_map_odom,
+            covariance=self._drift.covariance,
+            num_inliers=num_inliers,
+            verdict=verdict,
+        )
+
+    def _recognition(self, frame: NFrame) -> Recognition:
+        places = self._places or self._opened()
+        self._places = places
+        views = [view_of(features) for features in frame.features if features.descriptors.size]
+        return places.recognize(views, seed=frame.stamp_ns % 2**32)
+
+
+def _between(a: Odometry, b: Odometry, stamp_ns: int) -> SE3:
+    """Return the odometry's pose at a moment between two messages."""
+    fraction = (stamp_ns - a.stamp_ns) / max(b.stamp_ns - a.stamp_ns, 1)
+    return a.T_odom_base.interpolate(b.T_odom_base, min(max(fraction, 0.0), 1.0))
