@@ -17,7 +17,7 @@ from mapstream.operators.estimation.determinacy import determined
 from mapstream.operators.estimation.factors.inertial import outdated
 from mapstream.operators.estimation.noise import Factor
 from mapstream.operators.estimation.optimize_config import OptimizeConfig
-from mapstream.operators.estimation.outliers.absolute_outliers import reject_absolute
+from mapstream.operators.estimation.outliers.fix_judge import without_false_fixes
 from mapstream.operators.estimation.outliers.robust import Descent, RobustSolution
 from mapstream.operators.estimation.problem import (
     Problem,
@@ -36,6 +36,9 @@ from mapstream.operators.estimation.sparse_solver import sparse_levenberg_marqua
 from mapstream.operators.estimation.starts.landmark_starts import averaged_landmarks
 from mapstream.operators.estimation.starts.start import chordal_values
 from mapstream.operators.estimation.states import Values, with_solution
+from mapstream.operators.estimation.vision.bundle import FAMILIES
+from mapstream.operators.estimation.vision.bundle_solver import bundle_solver
+from mapstream.operators.estimation.vision.judging import judged, without_outliers
 from mapstream.recordings.maps.columns import BoolArray
 from mapstream.recordings.maps.model import Map
 from mapstream.streams.errors import EstimationError
@@ -66,6 +69,9 @@ def optimize_map(map_: Map, config: OptimizeConfig | None = None) -> tuple[Map, 
     started = time.perf_counter()
     if config.start_landmarks == "mean":
         map_ = averaged_landmarks(map_)
+    rejected: list[int] = []
+    if config.reject_absolute:
+        map_, rejected = without_false_fixes(map_)
     result, report, plain = _round(map_, config, started)
     for _ in range(_MOST_INTEGRATIONS - 1):
         if not outdated(result, plain):
@@ -73,24 +79,19 @@ def optimize_map(map_: Map, config: OptimizeConfig | None = None) -> tuple[Map, 
         before = report
         result, report, plain = _round(result, config, started)
         report = as_one(before, report)
-    return result, report
+    return result, replace(report, rejected_absolute=rejected)
 
 
 def _round(
     map_: Map, config: OptimizeConfig, started: float
 ) -> tuple[Map, OptimizationReport, Mapping[int, Factor]]:
     """Return the solution for IMU samples integrated with the biases of now, a report, and its factors."""
-    rejected: list[int] = []
-    if config.reject_absolute:
-        map_, rejection = reject_absolute(map_)
-        rejected = rejection.rejected
     problem = determined(make_problem(map_, config), config.underconstrained)
     try:
         best = _solve(problem, config, started)
     except RuntimeError as error:
         raise EstimationError(describe_failure(error, map_)) from error
-    report = replace(_report(problem, best, config), rejected_absolute=rejected)
-    report = replace(report, seconds=time.perf_counter() - started)
+    report = replace(_report(problem, best, config), seconds=time.perf_counter() - started)
     return _result(problem, best, config), report, problem.plain
 
 
@@ -100,7 +101,7 @@ def _solve(problem: Problem, config: OptimizeConfig, started: float) -> RobustSo
     limits = Limits(
         max_iterations=config.max_iterations, end_s=end_s, initial_lambda=config.initial_lambda
     )
-    descent = Descent(problem, config.gate_probability, SOLVERS[config.solver], limits)
+    descent = Descent(problem, config.gate_probability, _solver(problem, config), limits)
     starts = {"auto": ("current", "chordal")}.get(config.start, (config.start,))
     if not descent.contradicts_odometry():
         tried = []
@@ -118,6 +119,22 @@ def _solve(problem: Problem, config: OptimizeConfig, started: float) -> RobustSo
     return min(found, key=lambda each: each.cost)
 
 
+def _solver(problem: Problem, config: OptimizeConfig) -> Solver:
+    """Return the solver that the config asks for, with the bundle if there is one.
+
+    Raises:
+        EstimationError: If it has no place for observations.
+    """
+    if not problem.bundle:
+        return SOLVERS[config.solver]
+    if config.solver != "lm":
+        families = ", ".join(FAMILIES)
+        raise EstimationError(
+            f"solver {config.solver} takes no observations; set without to {families}, or solver: lm"
+        )
+    return bundle_solver(problem.bundle)
+
+
 def _values(problem: Problem, start: str, loops: BoolArray) -> Values:
     if start == "current":
         return problem.values
@@ -128,6 +145,8 @@ def _values(problem: Problem, start: str, loops: BoolArray) -> Values:
 def _result(problem: Problem, best: RobustSolution, config: OptimizeConfig) -> Map:
     """Return the map with the new state, and switches with what is known of them."""
     map_ = with_solution(problem.map, best.values, held=problem.fixed, fix=config.fix)
+    if problem.bundle:
+        map_ = without_outliers(map_, problem.bundle, best.values)
     switch, variance = map_.edges.switch.copy(), map_.edges.switch_variance.copy()
     rows = list(problem.loops)
     switch[rows] = best.is_true
@@ -139,10 +158,15 @@ def _report(problem: Problem, best: RobustSolution, config: OptimizeConfig) -> O
     rows = np.fromiter(problem.loops, dtype=np.int64)
     true = set(rows[best.is_true].tolist())
     kinds = _kinds(problem, true, best.values)
+    left_out = 0
+    if problem.bundle:
+        families, left_out = judged(problem.bundle, problem.values, best.values)
+        kinds |= families
     off = dict(zip(rows[~best.is_true].tolist(), best.chi2[~best.is_true].tolist(), strict=True))
     return OptimizationReport(
         num_vertices=len(problem.map.vertices),
         num_edges=problem.num_edges,
+        num_outliers=left_out,
         ignored=problem.ignored,
         error_before=0.5 * sum(kind.chi2_before for kind in kinds.values()),
         error_after=0.5 * sum(kind.chi2_after for kind in kinds.values()),

@@ -17,12 +17,14 @@ from mapstream.operators.estimation.fixing import fixes
 from mapstream.operators.estimation.keys import variable_of
 from mapstream.operators.estimation.noise import Factor
 from mapstream.operators.estimation.problem import Problem, describe_variable, graph_of
+from mapstream.operators.estimation.vision.bundle_solver import reduced_normal
 from mapstream.streams.arrays import FloatArray, IntArray
 from mapstream.streams.errors import EstimationError
 
 if TYPE_CHECKING:
     from scipy.sparse import csc_array
 
+_NULL_OF_BUNDLES = 1e-11  # what eliminating points leaves of a null direction
 _NULL = 1e-12  # curvature, where that along each variable alone is one
 _SHARE = 0.05  # of a null vector's largest part; smaller ones are rounding
 _MAX_DIRECTIONS = 8  # each is a mixture of all that are open, so that few name every variable
@@ -61,11 +63,16 @@ def determined(problem: Problem, policy: Literal["error", "prior"]) -> Problem:
 
 def open_variables(problem: Problem) -> list[int]:
     """Return the keys of variables that can move without any residual changing."""
-    if _is_full(problem):
+    if problem.bundle:
+        normal, owner = bundle_normal(problem)
+        limit = _NULL_OF_BUNDLES
+    elif _is_full(problem):
         return []
-    normal, owner = _normal_matrix(problem)
+    else:
+        normal, owner = _normal_matrix(problem)
+        limit = _NULL
     found: set[int] = set()
-    for vector in np.abs(_null_vectors(normal)):
+    for vector in np.abs(_null_vectors(normal, limit)):
         found.update(owner[vector > _SHARE * vector.max()].tolist())
     return sorted(found)
 
@@ -94,14 +101,27 @@ def _normal_matrix(problem: Problem) -> tuple[csc_array, IntArray]:
     return (unit.T @ unit).tocsc(), owner
 
 
+def bundle_normal(problem: Problem) -> tuple[csc_array, IntArray]:
+    """Return the same for a problem with a bundle, whose points are eliminated."""
+    from scipy import sparse  # noqa: PLC0415
+
+    normal, columns = reduced_normal(problem.bundle, problem.whole_graph(), problem.values)
+    owner = np.repeat(columns.keys, columns.sizes)
+    length = np.sqrt(normal.diagonal())
+    scale = sparse.diags_array(1 / np.where(length > 0, length, 1.0))
+    return (scale @ normal @ scale).tocsc(), owner
+
+
 def _size(problem: Problem, key: int) -> int:
     variable, row = variable_of(key)
     if variable == "landmark":
         return _SIZES[shape_of(problem.map.landmarks.kind[row])]
+    if variable in ("intrinsics", "time_offset"):
+        return len(problem.values.atVector(key))
     return 3 if variable == "velocity" else 6
 
 
-def _null_vectors(normal: csc_array) -> FloatArray:
+def _null_vectors(normal: csc_array, limit: float) -> FloatArray:
     """Return orthogonal directions (M, N) in which the normal matrix is zero, by subspace iteration."""
     from scipy import sparse  # noqa: PLC0415
     from scipy.sparse.linalg import splu  # noqa: PLC0415
@@ -112,7 +132,7 @@ def _null_vectors(normal: csc_array) -> FloatArray:
     for _ in range(_ITERATIONS):
         directions, _ = np.linalg.qr(inverse.solve(directions))
     curvature, turn = np.linalg.eigh(directions.T @ (normal @ directions))
-    vectors: FloatArray = (directions @ turn).T[curvature < _NULL]
+    vectors: FloatArray = (directions @ turn).T[curvature < limit]
     return vectors
 
 

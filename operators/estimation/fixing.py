@@ -24,6 +24,7 @@ Fixable = Literal[
     "extrinsics",
     "extrinsics_rotation",
     "extrinsics_translation",
+    "intrinsics",
     "base_frames",
 ]
 """What can be held as a whole; `frames` are outer frames, `base_frames` those of missions, also where guessed."""
@@ -35,6 +36,7 @@ _VARIABLES: dict[Fixable, Variable] = {
     "landmarks": "landmark",
     "frames": "frame",
     "extrinsics": "extrinsics",
+    "intrinsics": "intrinsics",
 }
 
 
@@ -48,6 +50,8 @@ def fixed_keys(keys: Iterable[int], fix: Iterable[Fixable]) -> set[int]:
     """Return those of the keys whose kind of variable shall stay, all of it."""
     rows = rows_by_variable(keys)
     chosen = [_VARIABLES[name] for name in fix if name in _VARIABLES]
+    if "extrinsics" in chosen:
+        chosen.append("camera")
     return {key_of(of, row) for of in chosen for row in rows.get(of, np.zeros(0, int)).tolist()}
 
 
@@ -61,8 +65,10 @@ def fixes(map_: Map, values: Any, keys: Iterable[int]) -> list[Factor]:  # noqa:
 
 def half_fixes(values: Any, fix: Iterable[Fixable]) -> list[Factor]:  # noqa: ANN401
     """Return factors that hold the rotations, or the translations, of extrinsics where the values have them."""
-    rows = rows_by_variable(values.keys()).get("extrinsics", np.zeros(0, np.int64)).tolist()
-    places = {key: values.atPose3(key) for key in (key_of("extrinsics", row) for row in rows)}
+    rows = rows_by_variable(values.keys())
+    sensors: tuple[Variable, ...] = ("extrinsics", "camera")
+    keys = [key_of(of, row) for of in sensors for row in rows.get(of, np.zeros(0, int)).tolist()]
+    places = {key: values.atPose3(key) for key in keys}
     made: list[Factor] = []
     for name in fix:
         if name == "extrinsics_rotation":
@@ -74,18 +80,19 @@ def half_fixes(values: Any, fix: Iterable[Fixable]) -> list[Factor]:  # noqa: AN
 
 def _hold(map_: Map, values: Any, key: int) -> Factor:  # noqa: ANN401
     variable, row = variable_of(key)
-    if variable == "velocity":
-        return gtsam.PriorFactorVector(key, values.atVector(key), _exactly(3))
+    if variable in ("velocity", "intrinsics", "time_offset"):
+        held = values.atVector(key)
+        return gtsam.PriorFactorVector(key, held, _exactly(len(held)))
     if variable == "bias":
         return gtsam.PriorFactorConstantBias(key, values.atConstantBias(key), _exactly(6))
     shape = shape_of(map_.landmarks.kind[row]) if variable == "landmark" else "pose"
-    if shape == "pose":
-        return gtsam.PriorFactorPose3(key, values.atPose3(key), _exactly(6))
     if shape == "plane":
         return OwnFactor(_exactly(3), [key], _same_plane(values.atOrientedPlane3(key)))
     if shape == "point2d":
         return gtsam.PriorFactorPoint2(key, values.atPoint2(key), _exactly(2))
-    return gtsam.PriorFactorPoint3(key, values.atPoint3(key), _exactly(3))
+    if shape == "point":
+        return gtsam.PriorFactorPoint3(key, values.atPoint3(key), _exactly(3))
+    return gtsam.PriorFactorPose3(key, values.atPose3(key), _exactly(6))
 
 
 def _exactly(size: int) -> Any:  # noqa: ANN401

@@ -16,13 +16,20 @@ _LEVEL_KINDS = ("imu", "gravity")  # they know where up is
 _TIGHT = 1e4  # per rad and per m; it holds what nothing else does, so it costs nothing
 
 
-def gauge_factors(map_: Map, factors: dict[int, Factor]) -> list[Factor]:
+def gauge_factors(
+    map_: Map, factors: dict[int, Factor], links: IntArray | None = None
+) -> list[Factor]:
     """Return factors that hold the oldest vertex of each part's best known mission.
 
     A part that is measured in the map's frame is not held. One that knows where up is keeps its tilt free.
+
+    Args:
+        map_: The map.
+        factors: By row of its edges.
+        links: Rows of vertices (N, 2) that something else joins, such as points that both saw.
     """
     rows = np.fromiter(factors, dtype=np.int64)
-    parts = _parts(map_, factors)
+    parts = _parts(map_, factors, np.zeros((0, 2), np.int64) if links is None else links)
     kinds = map_.edges.kind[rows]
     vertex = map_.edges.vertex_a[rows]
     is_held = np.isin(parts, parts[vertex[_is_in_the_map(map_, rows) & (vertex >= 0)]])
@@ -47,7 +54,7 @@ def _is_in_the_map(map_: Map, rows: IntArray) -> BoolArray:
     return is_tied
 
 
-def _parts(map_: Map, factors: dict[int, Factor]) -> IntArray:
+def _parts(map_: Map, factors: dict[int, Factor], links: IntArray) -> IntArray:
     """Return the number of the connected part (N,) of each vertex; landmarks and outer frames connect, too."""
     from scipy.sparse import coo_array  # noqa: PLC0415  # takes most of a second to import
     from scipy.sparse.csgraph import connected_components  # noqa: PLC0415
@@ -55,15 +62,15 @@ def _parts(map_: Map, factors: dict[int, Factor]) -> IntArray:
     edges, num = map_.edges, len(map_.vertices)
     rows = np.fromiter(factors, dtype=np.int64)
     has_two = (edges.vertex_a[rows] >= 0) & (edges.vertex_b[rows] >= 0)
-    pairs = [np.column_stack([edges.vertex_a[rows[has_two]], edges.vertex_b[rows[has_two]]])]
+    pairs = [links, np.column_stack([edges.vertex_a[rows[has_two]], edges.vertex_b[rows[has_two]]])]
     node_of: dict[int, int] = {}
     for row in rows[~has_two].tolist():
         nodes = [_node(key, num, node_of) for key in factors[row].keys()]  # noqa: SIM118
         pairs.append(np.array([(nodes[0], node) for node in nodes[1:]], np.int64).reshape(-1, 2))
     ends = np.concatenate(pairs)
     size = num + len(node_of)
-    links = coo_array((np.ones(len(ends)), (ends[:, 0], ends[:, 1])), shape=(size, size))
-    _, parts = connected_components(links, directed=False)
+    joined = coo_array((np.ones(len(ends)), (ends[:, 0], ends[:, 1])), shape=(size, size))
+    _, parts = connected_components(joined, directed=False)
     found: IntArray = parts[:num].astype(np.int64)
     return found
 

@@ -13,7 +13,17 @@ import numpy as np
 
 from mapstream.streams.arrays import IntArray
 
-Variable = Literal["pose", "velocity", "bias", "landmark", "frame", "extrinsics"]
+Variable = Literal[
+    "pose",
+    "velocity",
+    "bias",
+    "landmark",
+    "frame",
+    "extrinsics",
+    "camera",
+    "intrinsics",
+    "time_offset",
+]
 
 _LETTERS: dict[Variable, str] = {
     "velocity": "v",  # (3,) of the base, in the map frame [m/s]
@@ -21,6 +31,9 @@ _LETTERS: dict[Variable, str] = {
     "landmark": "l",  # Point3, Point2, Pose3 or OrientedPlane3, in the map frame
     "frame": "f",  # Pose3, T_map_frame
     "extrinsics": "e",  # Pose3, T_base_sensor; rows count the sensors of all missions
+    "camera": "c",  # Pose3, T_base_sensor of a camera; rows count the cameras of all missions
+    "intrinsics": "k",  # (P,) fx fy cx cy [xi] distortion of a camera
+    "time_offset": "t",  # (1,) by which a camera's images are later than their stamps [s]
 }
 _VARIABLES: dict[str, Variable] = {letter: variable for variable, letter in _LETTERS.items()}
 _INDEX_BITS = 56  # the letter lies above them

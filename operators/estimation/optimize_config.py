@@ -8,7 +8,8 @@ from pydantic import BaseModel, ConfigDict, Field, PositiveFloat, PositiveInt
 
 from mapstream.operators.estimation.fixing import Fixable
 
-Loss = Literal["huber", "cauchy", "geman_mcclure", "tukey"]
+Loss = Literal["huber", "cauchy", "geman_mcclure", "tukey", "squared"]
+Refinable = Literal["extrinsics", "intrinsics", "time_offset"]
 
 
 class OptimizeConfig(BaseModel):
@@ -33,18 +34,23 @@ class OptimizeConfig(BaseModel):
     gate_probability: float = Field(default=0.9999, gt=0, lt=1)
     """A switchable edge whose chi2 a true one stays below this often is false."""
     kinds: tuple[str, ...] | None = None
-    """The kinds of edges that take part; left out, all do."""
+    """The kinds of edges that take part; left out, all do. Observations are `keypoints` and `points`."""
     without: tuple[str, ...] = ()
-    """Kinds of edges that do not take part."""
+    """Kinds of edges that do not take part, and `keypoints` or `points`."""
     unanchored: Literal["join", "apart"] = "join"
     """Whether edges tie missions whose base frame is a guess to those where it is known; apart, they move none."""
     losses: dict[str, Loss] = {}
-    """A robust loss by kind of edge, for instance `odometry: huber`; others are squared."""
+    """A robust loss by kind of edge, for instance `odometry: huber`; others are squared, but `keypoints` and `points`
+    have huber from 3 sigma on."""
     loss_width: PositiveFloat = 1.0
     """Where losses begin to flatten, in units of where each usually does."""
     fix: tuple[Fixable, ...] = ()
     """What stays as it is: poses, velocities, biases, landmarks, frames (outer ones), extrinsics,
     extrinsics_rotation, extrinsics_translation, base_frames (of missions)."""
+    refine: tuple[Refinable, ...] = ()
+    """What is found of cameras: extrinsics, intrinsics, time_offset. The first stays near where it was measured."""
+    max_reprojection_error_px: PositiveFloat = 50.0
+    """Every third iteration observations beyond it, or behind their camera, leave, and those that fit come back."""
     underconstrained: Literal["error", "prior"] = "error"
     """What happens to variables that the edges do not determine: a weak prior holds them, or none."""
     reject_absolute: bool = False

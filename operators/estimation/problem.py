@@ -21,12 +21,14 @@ from mapstream.operators.estimation.outliers.consistency import chi2_gate
 from mapstream.operators.estimation.priors import prior_factors
 from mapstream.operators.estimation.solvers import Graph
 from mapstream.operators.estimation.states import Values, initial_values
+from mapstream.operators.estimation.vision.bundle import Bundle, make_bundle
+from mapstream.operators.estimation.vision.camera_states import camera_priors
 from mapstream.recordings.maps.columns import BoolArray
 from mapstream.recordings.maps.model import Map
 from mapstream.streams.arrays import FloatArray, IntArray
 
 _RELATIVE = ("odometry", "wheel", "registration", "motion_model", "loop")  # need no priors
-_LOSSES: dict[Loss, str] = {
+_LOSSES: dict[str, str] = {
     "huber": "Huber",
     "cauchy": "Cauchy",
     "geman_mcclure": "GemanMcClure",
@@ -34,7 +36,7 @@ _LOSSES: dict[Loss, str] = {
 }
 
 
-_USUAL_WIDTHS: dict[Loss, float] = {  # 95 % efficient without outliers (Zhang, IVC 1997, table 1)
+_USUAL_WIDTHS: dict[str, float] = {  # 95 % efficient without outliers (Zhang, IVC 1997, table 1)
     "huber": 1.345,
     "cauchy": 2.385,
     "geman_mcclure": 1.345,
@@ -56,6 +58,7 @@ class Problem:
     freedom: int  # directions that were measured, less those that are unknown
     ignored: dict[str, int]  # edges that do not take part, by kind
     underconstrained: list[str]  # variables that a weak prior holds
+    bundle: Bundle  # what sensors saw of points; may be empty
 
     @property
     def num_edges(self) -> dict[str, int]:
@@ -89,17 +92,24 @@ def make_problem(map_: Map, config: OptimizeConfig) -> Problem:
         if row in factors:
             factors[row] = weighted(factors[row], float(edges.switch[row] ** 2))
     for kind, loss in config.losses.items():
+        if loss == "squared":
+            continue
         for row in np.flatnonzero((edges.kind == kind) & ~may_switch).tolist():
             if row in factors:
                 factors[row] = with_loss(factors[row], loss, config.loss_width)
     plain = {row: factor for row, factor in factors.items() if not may_switch[row]}
     other = {row: f for row, f in factors.items() if edges.kind[row] not in _RELATIVE}
     held = [*prior_factors(map_, other).values()]
+    bundle = make_bundle(map_, config)
     if "poses" not in config.fix:
-        held += gauge_factors(map_, factors)
-    values = initial_values(map_, graph_of([*held, *factors.values()]).keyVector())
+        held += gauge_factors(map_, factors, bundle.links)
+    in_graph = graph_of([*held, *factors.values()]).keyVector()
+    values = initial_values(map_, {*in_graph, *bundle.keys})
+    held += camera_priors(values).values()
     fixed = fixed_keys(values.keys(), config.fix)
-    held += [*fixes(map_, values, fixed), *half_fixes(values, config.fix)]
+    alone = set(bundle.point_keys).difference(in_graph)  # the bundle itself holds these
+    held += [*fixes(map_, values, fixed - alone), *half_fixes(values, config.fix)]
+    num_residuals = bundle.num_residuals + sum(f.dim() for f in (*held, *factors.values()))
     return Problem(
         map=map_,
         plain=plain,
@@ -108,9 +118,10 @@ def make_problem(map_: Map, config: OptimizeConfig) -> Problem:
         fixed=fixed,
         values=values,
         base_graph=graph_of([*held, *plain.values()]),
-        freedom=sum(f.dim() for f in (*held, *factors.values())) - int(values.dim()),
+        freedom=num_residuals - int(values.dim()),
         ignored=dict(Counter(edges.kind[~takes_part].tolist())),
         underconstrained=[],
+        bundle=bundle,
     )
 
 
@@ -178,7 +189,7 @@ def describe_failure(error: RuntimeError, map_: Map) -> str:
 def describe_variable(key: int, map_: Map) -> str:
     """Return what a variable is, for people."""
     variable, row = variable_of(key)
-    if variable in ("landmark", "frame", "extrinsics"):
+    if variable in ("landmark", "frame", "extrinsics", "camera", "intrinsics", "time_offset"):
         return f"the {variable} in row {row}"
     mission = map_.mission_id(int(map_.vertices.mission[row]))
     stamp_ns = int(map_.vertices.stamp_ns[row])

@@ -46,6 +46,9 @@ class OptimizationReport:
     start: str = "current"  # which start led to the solution
     solver: str = "lm"
     kinds: dict[str, KindReport] = field(default_factory=dict)
+    num_outliers: int = (
+        0  # observations that lost their landmark: too far off, or behind the camera
+    )
     switched_off: list[int] = field(default_factory=list)  # rows of edges with a switch below 0.5
     dropped: list[DroppedEdge] = field(default_factory=list)  # the same, for people
     rejected_absolute: list[int] = field(
@@ -64,6 +67,8 @@ class OptimizationReport:
         for name, kind in self.kinds.items():
             chi2 = f"chi2 {kind.chi2_before:.6g} -> {kind.chi2_after:.6g}"
             yield f"{kind.count} edges of kind {name}: {chi2}"
+        if self.num_outliers:
+            yield f"{self.num_outliers} observations are false and lost their landmark"
         yield f"{len(self.dropped)} switched off"
         for edge in sorted(self.dropped, key=lambda each: -each.chi2)[:_TOLD]:
             ends = f"{edge.mission_a[:8]} {edge.stamp_a_ns} ns"

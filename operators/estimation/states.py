@@ -17,6 +17,7 @@ from mapstream.operators.estimation.fixing import Fixable
 from mapstream.operators.estimation.keys import Variable, key_of, rows_by_variable
 from mapstream.operators.estimation.landmark_states import insert_landmarks, with_landmarks
 from mapstream.operators.estimation.outer_frames import starting_frames
+from mapstream.operators.estimation.vision import camera_states
 from mapstream.recordings.maps.model import Map
 from mapstream.streams.arrays import FloatArray, IntArray
 from mapstream.streams.geometry import invert, straightened
@@ -65,7 +66,8 @@ def with_solution(
         row: values.atPose3(key_of("extrinsics", row)).matrix()
         for row in moved.get("extrinsics", nothing).tolist()
     }
-    return with_mounts(map_, places, fix) if places else map_
+    map_ = with_mounts(map_, places, fix) if places else map_
+    return camera_states.with_refined_cameras(map_, values, moved, fix)
 
 
 def _insert_poses(map_: Map, rows: IntArray, values: Values) -> None:
@@ -122,6 +124,9 @@ _INSERT: dict[Variable, Callable[[Map, IntArray, Values], None]] = {
     "landmark": insert_landmarks,
     "frame": _insert_frames,
     "extrinsics": _insert_mounts,
+    "camera": camera_states.insert_mounts,
+    "intrinsics": camera_states.insert_intrinsics,
+    "time_offset": camera_states.insert_time_offsets,
 }
 
 
