@@ -22,6 +22,8 @@ Tool = Callable[[Map], tuple[Map, Any]]
 """From a map to a new map and a report."""
 
 TOOLS = {
+    "anchor_missions": "mapstream.operators.places.anchoring:anchor_missions",
+    "close_visual_loops": "mapstream.operators.places.loops:find_visual_loops",
     "create_landmarks": "mapstream.operators.landmarks.create:create_landmarks",
     "evaluate_quality": "mapstream.operators.landmarks.quality:evaluate_quality",
     "fix_stationary": "mapstream.operators.maps.stationary:fix_stationary",
