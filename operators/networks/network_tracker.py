@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 import anyio.to_thread
-import numpy as np
 from pydantic import Field
 
-from mapstream.operators.features.rows import appended, rows_of
 from mapstream.operators.networks.matchers import Matcher, make_matcher
-from mapstream.operators.tracking.matched_tracks import Inputs, MatchedTracks, Outputs
-from mapstream.operators.tracking.two_point import OutlierOptions
+from mapstream.operators.tracking.matched_tracks import (
+    Inputs,
+    MatchedTracks,
+    MatchedTracksConfig,
+    Outputs,
+)
 from mapstream.streams.arrays import FloatArray, IntArray
 from mapstream.streams.messages.vision import ImageFeatures
 
 
-class NetworkTrackerConfig(OutlierOptions):
+class NetworkTrackerConfig(MatchedTracksConfig):
     """Options of `network_tracker`."""
 
     matcher: str = "lighterglue"
@@ -26,8 +28,7 @@ class NetworkTrackerConfig(OutlierOptions):
 class NetworkTracker(MatchedTracks):
     """Match keypoints from image to image with LightGlue, SuperGlue or their like.
 
-    A keypoint that one image misses is looked for in the next one as well. With an IMU, matches must agree with
-    one translation of the camera. A keypoint without a match begins a track.
+    With an IMU, matches must agree with one translation of the camera. A keypoint without a match begins a track.
     The default network comes with `mapstream models install lighterglue`.
     """
 
@@ -35,7 +36,6 @@ class NetworkTracker(MatchedTracks):
         super().__init__(config)
         self._config = config
         self._matcher: Matcher | None = None
-        self._num_seen: dict[tuple[str, str], int] = {}  # keypoints of the image before itself
 
     async def run(self, inputs: Inputs, outputs: Outputs) -> None:
         self._matcher = await anyio.to_thread.run_sync(self._open)
@@ -51,18 +51,6 @@ class NetworkTracker(MatchedTracks):
         if self._matcher is None:
             self._matcher = self._open()
         return self._matcher.match(before, now)
-
-    def track(self, features: ImageFeatures, turn: FloatArray | None = None) -> ImageFeatures:
-        """Return the keypoints of the next image with their track ids."""
-        key = (features.frame, features.kind)
-        before, count = self._before.get(key), self._num_seen.get(key, 0)
-        tracked = super().track(features, turn)
-        if before is not None and before.track_ids is not None and tracked.track_ids is not None:
-            is_missed = ~np.isin(before.track_ids, tracked.track_ids)
-            is_missed[count:] = False  # for the second time
-            self._before[key] = appended(tracked, rows_of(before, is_missed))
-        self._num_seen[key] = len(features)
-        return tracked
 
     def _open(self) -> Matcher:
         return make_matcher(self._config.matcher, self._config.min_score)

@@ -3,25 +3,28 @@
 from __future__ import annotations
 
 import numpy as np
+from pydantic import NonNegativeInt
 
 from mapstream.operators.operator import warn
-from mapstream.operators.tracking.matched_tracks import MatchedTracks
+from mapstream.operators.tracking.matched_tracks import MatchedTracks, MatchedTracksConfig
 from mapstream.operators.tracking.turning import turned_px
-from mapstream.operators.tracking.two_point import OutlierOptions
 from mapstream.operators.tracking.windows import WindowRules, matched_near
 from mapstream.streams.arrays import FloatArray, IntArray
 from mapstream.streams.messages.vision import ImageFeatures
 
 
-class FeatureTrackerConfig(WindowRules, OutlierOptions):
+class FeatureTrackerConfig(WindowRules, MatchedTracksConfig):
     """Options of `feature_tracker`."""
+
+    max_missed: NonNegativeInt = 3
+    """So many images in a row may miss a keypoint before its track ends."""
 
 
 class FeatureTracker(MatchedTracks):
     """Match keypoints by their descriptors from image to image, near where the gyroscope expects them.
 
     Without an IMU a keypoint is expected where it was. With one, matches must agree with one translation of the
-    camera. A keypoint without a match begins a track.
+    camera. A keypoint that is missed waits for some images; one without a match begins a track.
     """
 
     def __init__(self, config: FeatureTrackerConfig) -> None:

@@ -6,10 +6,14 @@ from abc import abstractmethod
 from dataclasses import dataclass, replace
 from typing import ClassVar
 
+import numpy as np
+from pydantic import NonNegativeInt
+
+from mapstream.operators.features.rows import appended, rows_of
 from mapstream.operators.operator import Operator, Placement, offload
 from mapstream.operators.tracking.rays import rays
 from mapstream.operators.tracking.track_ids import TrackNumbers, carried_on
-from mapstream.operators.tracking.turning import GyroTurns
+from mapstream.operators.tracking.turning import GyroTurns, turned_px
 from mapstream.operators.tracking.two_point import OutlierOptions, agreeing
 from mapstream.streams.arrays import FloatArray, IntArray
 from mapstream.streams.channel import Receiver, Sender
@@ -33,14 +37,25 @@ class Outputs:
     features: Sender[ImageFeatures]
 
 
+_NONE = np.empty(0, np.int64)
+_NO_MATCHES = np.empty((0, 2), np.int64)
+
+
+class MatchedTracksConfig(OutlierOptions):
+    """How keypoints that match become tracks."""
+
+    max_missed: NonNegativeInt = 1
+    """So many images in a row may miss a keypoint before its track ends."""
+
+
 class MatchedTracks(Operator[Inputs, Outputs]):
     """Match keypoints from image to image; a keypoint without a match begins a track."""
 
     placement: ClassVar[Placement] = "thread"
 
-    def __init__(self, config: OutlierOptions) -> None:
+    def __init__(self, config: MatchedTracksConfig) -> None:
         self._options = config
-        self._before: dict[tuple[str, str], ImageFeatures] = {}  # by camera and kind
+        self._known: dict[tuple[str, str], _Known] = {}  # by camera and kind
         self._numbers: dict[tuple[str, str], TrackNumbers] = {}
 
     @abstractmethod
@@ -65,15 +80,17 @@ class MatchedTracks(Operator[Inputs, Outputs]):
             turn: R_now_before (3, 3) of their camera since the image before, if it is known.
         """
         key = (features.frame, features.kind)
-        before = self._before.get(key)
         numbers = self._numbers.setdefault(key, TrackNumbers(features.frame))
-        if before is None or before.track_ids is None:
-            track_ids = numbers.take(len(features))
-        else:
-            matches = self.matches(before, features, turn)
-            track_ids = carried_on(before.track_ids, matches, len(features), numbers)
-        self._before[key] = replace(features, track_ids=track_ids)
-        return self._before[key]
+        known = self._known.get(key, _Known(rows_of(features, _NONE), _NONE))
+        matches = self.matches(known.features, features, turn) if len(known.missed) else _NO_MATCHES
+        track_ids = carried_on(known.track_ids, matches, len(features), numbers)
+        tracked = replace(features, track_ids=track_ids)
+        waiting = known.waiting(matches[:, 0], self._options.max_missed, turn)
+        self._known[key] = _Known(
+            appended(tracked, waiting.features),
+            np.concatenate([np.zeros(len(tracked), np.int64), waiting.missed]),
+        )
+        return tracked
 
     def matches(
         self, before: ImageFeatures, now: ImageFeatures, turn: FloatArray | None
@@ -85,3 +102,29 @@ class MatchedTracks(Operator[Inputs, Outputs]):
         start = rays(now.camera, before.keypoints_px[found[:, 0]])
         end = rays(now.camera, now.keypoints_px[found[:, 1]])
         return found[agreeing(start, end, turn, self._options, seed=now.stamp_ns)]
+
+
+@dataclass(frozen=True, slots=True)
+class _Known:
+    """Keypoints that the next image may show: those of the newest one, and some that it missed."""
+
+    features: ImageFeatures
+    missed: IntArray  # (N,) images in a row that missed each
+
+    @property
+    def track_ids(self) -> IntArray:
+        ids = self.features.track_ids
+        return _NONE if ids is None else ids
+
+    def waiting(self, matched_rows: IntArray, max_missed: int, turn: FloatArray | None) -> _Known:
+        """Return what was not matched, where the camera's turn takes it; without what was missed too often."""
+        camera = self.features.camera
+        is_waiting = self.missed < max_missed
+        is_waiting[matched_rows] = False
+        features, missed = rows_of(self.features, is_waiting), self.missed[is_waiting] + 1
+        px = turned_px(camera, features.keypoints_px, turn)
+        if camera is None:
+            return _Known(features, missed)
+        size_px = [camera.width_px, camera.height_px]
+        is_inside = np.flatnonzero(((px >= 0) & (px <= np.array(size_px) - 1)).all(axis=1))
+        return _Known(rows_of(replace(features, keypoints_px=px), is_inside), missed[is_inside])

@@ -192,6 +192,28 @@ def test_carried_on_gives_each_keypoint_a_number_that_no_other_has() -> None:
     assert min(*first, *second) >= 0
 
 
+@pytest.mark.parametrize(("max_missed", "is_found"), [(2, True), (1, False)])
+async def test_a_missed_keypoint_waits_where_the_camera_turns_it(
+    *, max_missed: int, is_found: bool
+) -> None:
+    px = np.array([[320.0, 240.0]], np.float32)
+    step = so3_exp([0, 0.05, 0])  # 20 px
+    bits = np.random.default_rng(0).integers(0, 256, (1, 64), np.uint8)
+    tracker = FeatureTracker(FeatureTrackerConfig(max_missed=max_missed))
+    seen = []
+    for i in range(4):
+        is_missed = i in (1, 2)
+        message = ImageFeatures(
+            stamp_ns=i + 1, kind="brisk", frame="front", camera=CAMERA,
+            keypoints_px=np.empty((0, 2), np.float32) if is_missed else px,
+            descriptors=bits[:0] if is_missed else bits,
+        )  # fmt: skip
+        seen.append(tracker.track(message, step if i else None))
+        px = turned_px(CAMERA, px, step)
+
+    assert (seen[0].track_ids == seen[3].track_ids) == is_found
+
+
 async def test_what_the_imu_lacks_is_counted_and_tracking_goes_on() -> None:
     views = walk(6, 0.0)
     found = _features(views)
