@@ -28,6 +28,7 @@ BUILT_IN = {
     "cloud_sink": "mapstream.operators.sinks.cloud:CloudSink",
     "depth_registration": "mapstream.operators.images.depth_registration:DepthRegistration",
     "eight_bits": "mapstream.operators.images.eight_bits:EightBits",
+    "external_features": "mapstream.operators.features.external_features:ExternalFeatures",
     "external_loops": "mapstream.operators.submaps.external_loops:ExternalLoops",
     "feature_tracker": "mapstream.operators.tracking.feature_tracker:FeatureTracker",
     "features": "mapstream.operators.features.features:Features",

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from mapstream.recordings.feature_checks import feature_faults, width_fault
 from mapstream.recordings.stamp_checks import Finding
 from mapstream.streams.arrays import FloatArray
 from mapstream.streams.messages.constraints import Constraint, LoopClosure
@@ -26,6 +27,7 @@ class InputChecks:
         self._reasons: Counter[str] = Counter()
         self._first: dict[str, int] = {}  # stamp
         self._previous: Odometry | None = None
+        self._features: dict[str, ImageFeatures] = {}  # the last of each kind
 
     def see(self, message: Any) -> None:  # noqa: ANN401  # of any type; those without rules pass
         """Take note of one message."""
@@ -38,10 +40,17 @@ class InputChecks:
         elif isinstance(message, LoopClosure):
             found = loop_faults(message)
         elif isinstance(message, ImageFeatures):
-            found = feature_faults(message)
+            found = self._feature_faults(message)
         for reason in found:
             self._reasons[reason] += 1
             self._first.setdefault(reason, message.stamp_ns)
+
+    def _feature_faults(self, message: ImageFeatures) -> list[str]:
+        before = self._features.get(message.kind)
+        change = width_fault(message, before) if before is not None else ""
+        if len(message) and not change:
+            self._features[message.kind] = message
+        return [*feature_faults(message), *([change] if change else [])]
 
     def findings(self) -> list[Finding]:
         """Return one finding for each reason."""
@@ -98,18 +107,6 @@ def loop_faults(message: LoopClosure) -> list[str]:
         found.append("a stamp is zero or below")
     if (message.robot_a, message.stamp_a_ns) == (message.robot_b, message.stamp_b_ns):
         found.append("both its ends are one instant")
-    return found
-
-
-def feature_faults(message: ImageFeatures) -> list[str]:
-    """Return what is wrong with the features of an image."""
-    found = []
-    if message.descriptors.dtype not in (np.uint8, np.float32):
-        found.append(f"descriptors are uint8 bits or float32, not {message.descriptors.dtype}")
-    if not np.isfinite(message.keypoints_px).all():
-        found.append("keypoints are not finite")
-    if not message.kind:
-        found.append("no `kind`; features of different kinds never meet, so it needs a name")
     return found
 
 

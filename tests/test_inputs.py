@@ -29,6 +29,8 @@ KINDS = {
     "loops": LoopClosure,
     "positions": Constraint,
     "features": ImageFeatures,
+    "tracks": ImageFeatures,
+    "points": ImageFeatures,
 }
 TIGHT = np.diag([1e-4] * 6)
 NOWHERE = SE3.identity()
@@ -108,6 +110,21 @@ def features(**fields: Any) -> ImageFeatures:  # noqa: ANN401
             "descriptors are uint8 bits or float32, not float64",
         ),
         (features(keypoints_px=np.full((2, 2), np.nan, np.float32)), "keypoints are not finite"),
+        (features(descriptors=np.full((2, 8), np.nan, np.float32)), "descriptors are not finite"),
+        (features(frame=""), "no `frame`; it names the camera"),
+        (
+            features(keypoints_px=np.full((10, 2), 0.3, np.float32), descriptors=np.empty((10, 0))),
+            "keypoints are pixels, these look normalised",
+        ),
+        (features(track_ids=np.array([4, 4])), "a track id comes twice in one image"),
+        (features(track_ids=np.array([-5, -1])), "track ids are not negative, but for -1"),
+        (features(points_m=np.array([[1, 2, np.nan], [1, 2, 3]])), "points_m are whole, or NaN"),
+        (features(sigmas_px=np.zeros(2)), "sigmas_px are finite and positive; zeros would mean"),
+        (
+            features(points_m=np.ones((2, 3)), point_sigmas_m=np.array([0.1, np.inf])),
+            "point_sigmas_m are finite and positive",
+        ),
+        (features(offsets_ns=np.array([0, 2 * 10**9])), "offsets_ns count from stamp_ns"),
     ],
 )
 def test_U2_the_doctor_explains_every_rejected_message(

@@ -15,11 +15,16 @@ from mapstream.streams.arrays import IntArray
 _CAMERA_BITS = 0x7FFFFFFF  # 31 of the 32, so that numbers stay positive
 
 
+def first_number(frame: str) -> int:
+    """Return the least number that the tracks of a camera have."""
+    return (crc32(frame.encode()) & _CAMERA_BITS) << 32
+
+
 class TrackNumbers:
     """Gives the tracks of one camera numbers that never come twice."""
 
     def __init__(self, frame: str) -> None:
-        self._next = (crc32(frame.encode()) & _CAMERA_BITS) << 32
+        self._next = first_number(frame)
 
     def take(self, count: int) -> IntArray:
         """Return new numbers (count,), growing."""
