@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 from typing import TypeVar
 
 import cv2
@@ -17,12 +16,13 @@ import numpy as np
 
 from mapstream.recordings.worlds.paint import Picture
 from mapstream.recordings.worlds.surfaces import Surface, pyramid
+from mapstream.recordings.worlds.tiles import tiles_of
 from mapstream.streams.arrays import BoolArray, Float32Array, FloatArray, IntArray
 
 A = TypeVar("A", Picture, Float32Array, IntArray)
 
+_DEPTH = 0  # the line that is 1 / z
 _NEAR_M = 0.05
-_TILE_M = 2.5  # a larger surface is drawn in parts, each with the level of detail of its distance
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -70,14 +70,23 @@ class Renderer:
     def __init__(self, surfaces: Sequence[Surface]) -> None:
         self.surfaces = tuple(surfaces)
         self._levels = [pyramid(surface.picture) for surface in self.surfaces]
-        tiles = [tile for row, surface in enumerate(self.surfaces) for tile in _tiles(row, surface)]
-        self._tiles = sorted(tiles, key=lambda tile: not self._is_shell(tile))  # the shell first
-        owners = [self.surfaces[tile.surface] for tile in self._tiles]
-        self._corners = np.stack([tile.corners for tile in self._tiles])  # (N, 4, 3) [m]
+        tiles = [
+            tile for row, surface in enumerate(self.surfaces) for tile in tiles_of(row, surface)
+        ]
+        tiles.sort(key=lambda tile: not self.surfaces[tile.surface].is_shell)  # that comes first
+        owners = [self.surfaces[tile.surface] for tile in tiles]
+        self._owners = np.array([tile.surface for tile in tiles])
+        self._corners = np.stack([tile.corners for tile in tiles])  # (N, 4, 3) [m]
         self._origins = np.stack([owner.origin for owner in owners])
         self._axes = np.stack([[owner.right, owner.down] for owner in owners])  # (N, 2, 3)
         self._normals = np.stack([owner.normal for owner in owners])
-        self._texels_m = np.array([tile.texel_m for tile in self._tiles])
+        self._texels_m = np.array([owner.texel_m for owner in owners])
+        self._top_levels = np.array([len(self._levels[row]) - 1 for row in self._owners])
+        self._num_lines = np.array([1 + len(tile.edges) for tile in tiles])
+        self._lines = np.zeros((len(tiles), self._num_lines.max(), 3))  # of [s, t, 1]
+        self._lines[:, _DEPTH, 2] = 1
+        for row, tile in enumerate(tiles):
+            self._lines[row, 1 : 1 + len(tile.edges)] = tile.edges
 
     def image(self, camera: Pinhole, T_world_camera: FloatArray) -> Picture:
         """Return what is seen from a pose (4, 4); black where nothing is."""
@@ -85,9 +94,9 @@ class Renderer:
         depths = np.zeros(image.shape[:2], np.float32)
         for patch in self._patches(camera, T_world_camera):
             mask = patch.mask()
-            if not self._is_shell(patch.tile):  # nothing was drawn before the shell
+            if not self.surfaces[patch.surface].is_shell:  # nothing was drawn before the shell
                 patch.test_depth(mask, depths)
-            patch.draw(mask, self._levels[patch.tile.surface], image)
+            patch.draw(mask, self._levels[patch.surface][patch.level], image)
         return image
 
     def rendering(self, camera: Pinhole, T_world_camera: FloatArray) -> Rendering:
@@ -98,12 +107,9 @@ class Renderer:
         for patch in self._patches(camera, T_world_camera):
             mask = patch.mask()
             patch.test_depth(mask, depths)
-            patch.draw(mask, self._levels[patch.tile.surface], image)
-            patch.part(surfaces)[mask] = patch.tile.surface
+            patch.draw(mask, self._levels[patch.surface][patch.level], image)
+            patch.part(surfaces)[mask] = patch.surface
         return Rendering(image, depths, surfaces)
-
-    def _is_shell(self, tile: _Tile) -> bool:
-        return self.surfaces[tile.surface].is_shell
 
     def _blank(self, camera: Pinhole) -> Picture:
         width, height = camera.size_px
@@ -122,8 +128,21 @@ class Renderer:
         )
         plane_by_px = np.linalg.inv(camera.matrix @ np.swapaxes(in_camera, 1, 2))  # [s, t, 1] / z
         levels = self._detail(rows, plane_by_px, (low + high) / 2)
+        texels_by_px = self._picture_by_px(rows, levels, plane_by_px, low)
+        lines = self._lines[rows] @ plane_by_px  # (N, L, 3) of [x, y, 1]
+        width, height = camera.size_px
+        across = (lines[..., :1] * np.arange(width)).astype(np.float32)
+        along = (lines[..., 1:2] * np.arange(height) + lines[..., 2:]).astype(np.float32)
         for at, row in enumerate(rows):
-            yield _Patch(self._tiles[row], plane_by_px[at], low[at], high[at], levels[at])
+            (x0, y0), (x1, y1), num = low[at].tolist(), high[at].tolist(), self._num_lines[row]
+            yield _Patch(
+                int(self._owners[row]),
+                int(levels[at]),
+                texels_by_px[at],
+                (slice(y0, y1), slice(x0, x1)),
+                across[at, :num, None, x0:x1],
+                along[at, :num, y0:y1, None],
+            )
 
     def _detail(self, rows: IntArray, plane_by_px: FloatArray, px: FloatArray) -> IntArray:
         """Return the levels of detail (N,) whose texels are about as large as pixels (N, 2)."""
@@ -131,37 +150,19 @@ class Renderer:
         safe = np.maximum(inverse_depth, 1e-2)
         m2_per_px = np.abs(np.linalg.det(plane_by_px)) / safe**3
         texels_per_px = np.sqrt(m2_per_px) / self._texels_m[rows]
-        levels: IntArray = np.rint(np.log2(np.maximum(texels_per_px, 1))).astype(np.int64)
-        return levels
+        levels = np.rint(np.log2(np.maximum(texels_per_px, 1))).astype(np.int64)
+        detail: IntArray = np.minimum(levels, self._top_levels[rows])
+        return detail
 
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Tile:
-    surface: int
-    corners: FloatArray  # (4, 3) [m] of its bounding rectangle
-    edges: FloatArray  # (E, 3) of the surface's plane
-    texel_m: float
-
-
-def _tiles(row: int, surface: Surface) -> Iterator[_Tile]:
-    """Cut a rectangle into parts; they share its picture, so that no seam is seen."""
-    if not surface.is_rectangle:
-        (width, height), edges = surface.size_m.tolist(), surface.edges()
-        yield _Tile(row, surface.points(_rectangle(0, width, 0, height)), edges, surface.texel_m)
-        return
-    counts = np.maximum(1, np.ceil(surface.size_m / _TILE_M)).astype(int)
-    s, t = (
-        np.linspace(0, side, n + 1).tolist() for side, n in zip(surface.size_m, counts, strict=True)
-    )
-    for s0, s1 in pairwise(s):
-        for t0, t1 in pairwise(t):
-            edges = np.array([[1, 0, -s0], [-1, 0, s1], [0, 1, -t0], [0, -1, t1]])
-            corners = surface.points(_rectangle(s0, s1, t0, t1))
-            yield _Tile(row, corners, edges, surface.texel_m)
-
-
-def _rectangle(s0: float, s1: float, t0: float, t1: float) -> FloatArray:
-    return np.array([[s0, t0], [s1, t0], [s1, t1], [s0, t1]])
+    def _picture_by_px(
+        self, rows: IntArray, levels: IntArray, plane_by_px: FloatArray, low: IntArray
+    ) -> FloatArray:
+        """Return matrices (N, 3, 3) from pixels of patches that begin at `low` to texels of the levels."""
+        texels = plane_by_px.copy()
+        texels[:, :2] /= (self._texels_m[rows] * 2.0**levels)[:, None, None]
+        texels[:, :2] -= 0.5 * texels[:, 2:]  # the middle of the first texel is at half a texel
+        texels[:, :, 2] += (texels[:, :, :2] * low[:, None]).sum(axis=2)
+        return texels
 
 
 def _bounds(corners: FloatArray, camera: Pinhole) -> tuple[IntArray, IntArray]:
@@ -182,51 +183,41 @@ def _bounds(corners: FloatArray, camera: Pinhole) -> tuple[IntArray, IntArray]:
     return first.astype(np.int64), last.astype(np.int64)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(slots=True, eq=False)
 class _Patch:
     """The part of the image that one tile may cover."""
 
-    tile: _Tile
-    plane_by_px: FloatArray  # (3, 3)
-    low: IntArray  # (2,) first pixel
-    high: IntArray  # (2,) one beyond the last
+    surface: int
     level: int
+    picture_by_px: FloatArray  # (3, 3) from the patch's pixels
+    place: tuple[slice, slice]  # rows and columns of the image
+    across: (
+        Float32Array  # (L, 1, W) a x of lines a x + b y + c: 1 / z, and the edges, positive inside
+    )
+    along: Float32Array  # (L, H, 1) b y + c
 
     def part(self, image: A) -> A:
-        view: A = image[self.low[1] : self.high[1], self.low[0] : self.high[0]]
+        view: A = image[self.place]
         return view
-
-    def _linear(self, lines: FloatArray) -> tuple[Float32Array, Float32Array]:
-        """Return a x (E, 1, W) and b y + c (E, H, 1) of lines (E, 3) for the patch's pixels."""
-        (x0, y0), (x1, y1) = self.low.tolist(), self.high.tolist()
-        across = np.multiply.outer(lines[:, 0], np.arange(x0, x1)).astype(np.float32)
-        along = np.multiply.outer(lines[:, 1], np.arange(y0, y1)) + lines[:, 2:]
-        return across[:, None], along.astype(np.float32)[:, :, None]
 
     def mask(self) -> BoolArray:
         """Return the pixels whose middle looks at the tile."""
-        across, along = self._linear(self.tile.edges @ self.plane_by_px)
-        mask: BoolArray = np.logical_and.reduce(across >= -along)
+        mask: BoolArray = np.logical_and.reduce(self.across[1:] >= -self.along[1:])
         return mask
 
     def test_depth(self, mask: BoolArray, depths: Float32Array) -> None:
         """Take what is hidden from the mask, and write down the inverse depth of the rest."""
-        across, along = self._linear(self.plane_by_px[2:])
-        mine, part = (across + along)[0], self.part(depths)
+        mine, part = self.across[_DEPTH] + self.along[_DEPTH], self.part(depths)
         mask &= mine > part
         cv2.copyTo(mine, mask.view(np.uint8), part)
 
-    def draw(self, mask: BoolArray, levels: Sequence[Picture], image: Picture) -> None:
-        """Copy the tile's picture to the mask."""
-        level = min(self.level, len(levels) - 1)
-        texel_m = self.tile.texel_m * 2**level
-        # The middle of the first texel of a level is at half a texel, and the first pixel at 0.
-        texel_by_plane = np.array([[1 / texel_m, 0, -0.5], [0, 1 / texel_m, -0.5], [0, 0, 1]])
-        px_by_patch = np.array([[1, 0, self.low[0]], [0, 1, self.low[1]], [0, 0, 1.0]])
+    def draw(self, mask: BoolArray, picture: Picture, image: Picture) -> None:
+        """Copy the picture to the mask."""
+        height, width = mask.shape
         drawn = cv2.warpPerspective(
-            levels[level],
-            texel_by_plane @ self.plane_by_px @ px_by_patch,
-            (self.high - self.low).tolist(),
+            picture,
+            self.picture_by_px,
+            (width, height),
             flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
             borderMode=cv2.BORDER_REPLICATE,
         )
