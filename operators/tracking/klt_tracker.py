@@ -74,7 +74,12 @@ class KltTracker:
         if self._finds_corners and len(live.features) < self._config.max_tracks:
             detections = self._corners(frame, image)
         elif detections is not None:
-            live = live.refreshed_by(detections)
+            reason = live.unlike(detections)
+            if reason is None:
+                live = live.refreshed_by(detections)
+            else:
+                warn(reason)
+                detections = None
         if detections is not None:
             live = self._joined(live, detections, image)
         self._image, self._live = image, live

@@ -49,6 +49,21 @@ class LiveTracks:
         )
         return LiveTracks(features, self.ages + 1, self.right_shifts_px)
 
+    def unlike(self, detections: ImageFeatures) -> str | None:
+        """Return why detections cannot become tracks beside these, None if they can."""
+        ours, theirs = self.features, detections
+        if len(ours) == 0 or len(theirs) == 0:
+            return None
+        if ours.kind != theirs.kind:
+            return (
+                f"keypoints of kind {theirs.kind} where tracks are of kind {ours.kind}; "
+                "give each kind an operator of its own"
+            )
+        if ours.descriptors.shape[1] != theirs.descriptors.shape[1]:
+            widths = f"{ours.descriptors.shape[1]} to {theirs.descriptors.shape[1]}"
+            return f"descriptors of kind {theirs.kind} changed their length from {widths}"
+        return None
+
     def joined_by(self, features: ImageFeatures) -> LiveTracks:
         """Return the tracks and new ones."""
         new = LiveTracks.new(features)

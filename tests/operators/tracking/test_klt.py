@@ -276,6 +276,27 @@ async def test_images_of_another_size_or_without_a_partner_are_counted() -> None
     assert any("without calibration" in text for text in activity.warnings)
 
 
+async def test_keypoints_of_another_kind_or_length_are_named_and_left_out() -> None:
+    views = drive(5, _STILL, _STILL)
+    frames = [view.camera_frame() for view in views]
+    given = [Features(FeaturesConfig(kind="brisk", max_features=60)).detect(f) for f in frames]
+    given[1] = replace(given[1], kind="freak")
+    given[3] = replace(given[3], descriptors=given[3].descriptors[:, :32])
+    activity = Activity()
+
+    out = await run_operator(
+        Klt(KltConfig()), run_context=Context(activity=activity), frames=frames, features=given
+    )
+
+    assert {f.kind for f in out["features"]} == {"brisk"}
+    assert {f.descriptors.shape[1] for f in out["features"]} == {64}
+    assert activity.warnings == {
+        "keypoints of kind freak where tracks are of kind brisk; "
+        "give each kind an operator of its own": 1,
+        "descriptors of kind brisk changed their length from 64 to 32": 1,
+    }
+
+
 async def test_a_camera_without_calibration_is_tracked_without_the_gyroscope() -> None:
     views = drive(3, _STILL, (0.1, 0.0, 0.0))
     frames = [replace(view.camera_frame(), camera=None) for view in views]
