@@ -24,7 +24,6 @@ from mapstream.streams.errors import EstimationError
 if TYPE_CHECKING:
     from scipy.sparse import csc_array
 
-_NULL_OF_BUNDLES = 1e-11  # what eliminating points leaves of a null direction
 _NULL = 1e-12  # curvature, where that along each variable alone is one
 _SHARE = 0.05  # of a null vector's largest part; smaller ones are rounding
 _MAX_DIRECTIONS = 8  # each is a mixture of all that are open, so that few name every variable
@@ -65,14 +64,12 @@ def open_variables(problem: Problem) -> list[int]:
     """Return the keys of variables that can move without any residual changing."""
     if problem.bundle:
         normal, owner = bundle_normal(problem)
-        limit = _NULL_OF_BUNDLES
     elif _is_full(problem):
         return []
     else:
         normal, owner = _normal_matrix(problem)
-        limit = _NULL
     found: set[int] = set()
-    for vector in np.abs(_null_vectors(normal, limit)):
+    for vector in np.abs(_null_vectors(normal)):
         found.update(owner[vector > _SHARE * vector.max()].tolist())
     return sorted(found)
 
@@ -121,7 +118,7 @@ def _size(problem: Problem, key: int) -> int:
     return 3 if variable == "velocity" else 6
 
 
-def _null_vectors(normal: csc_array, limit: float) -> FloatArray:
+def _null_vectors(normal: csc_array) -> FloatArray:
     """Return orthogonal directions (M, N) in which the normal matrix is zero, by subspace iteration."""
     from scipy import sparse  # noqa: PLC0415
     from scipy.sparse.linalg import splu  # noqa: PLC0415
@@ -132,7 +129,7 @@ def _null_vectors(normal: csc_array, limit: float) -> FloatArray:
     for _ in range(_ITERATIONS):
         directions, _ = np.linalg.qr(inverse.solve(directions))
     curvature, turn = np.linalg.eigh(directions.T @ (normal @ directions))
-    vectors: FloatArray = (directions @ turn).T[curvature < limit]
+    vectors: FloatArray = (directions @ turn).T[curvature < _NULL]
     return vectors
 
 

@@ -49,6 +49,8 @@ class OptimizeConfig(BaseModel):
     extrinsics_rotation, extrinsics_translation, base_frames (of missions)."""
     refine: tuple[Refinable, ...] = ()
     """What is found of cameras: extrinsics, intrinsics, time_offset. The first stays near where it was measured."""
+    refined_cameras: tuple[str, ...] = ()
+    """Names of the cameras that `refine` is about; without, all."""
     max_reprojection_error_px: PositiveFloat = 50.0
     """Every third iteration observations beyond it, or behind their camera, leave, and those that fit come back."""
     underconstrained: Literal["error", "prior"] = "error"

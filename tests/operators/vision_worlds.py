@@ -40,26 +40,27 @@ def stereo(calibration: CameraCalibration = PINHOLE, baseline_m: float = 0.3) ->
     }  # fmt: skip
 
 
-def poses_at(times_s: FloatArray) -> FloatArray:
-    """Where the base is (N, 4, 4): it sways in all six directions."""
+def poses_at(times_s: FloatArray, tilt: float = 1.0) -> FloatArray:
+    """Where the base is (N, 4, 4): it sways in all six directions, and rolls and pitches more with more tilt."""
     t = np.asarray(times_s, dtype=np.float64)
     waves = np.stack([
         1.2 * np.sin(0.9 * t), 1.5 * np.sin(0.7 * t), 0.5 * np.sin(1.3 * t),
-        0.15 * np.sin(1.1 * t), 0.2 * np.sin(0.8 * t), 0.35 * np.sin(0.6 * t),
+        tilt * 0.15 * np.sin(1.1 * t), tilt * 0.2 * np.sin(0.8 * t), 0.35 * np.sin(0.6 * t),
     ], axis=1)  # fmt: skip
     T = np.tile(np.eye(4), (len(t), 1, 1))
     T[:, :3, :3], T[:, :3, 3] = so3_exp(waves[:, 3:]), waves[:, :3]
     return T
 
 
-def imu_at(times_s: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+def imu_at(times_s: FloatArray, tilt: float = 1.0) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return rates, specific forces and velocities (N, 3), by differences."""
     h, G = 1e-4, GRAVITY
-    before, now, after = (poses_at(times_s + dt) for dt in (-h, 0, h))
-    gyro: FloatArray = so3_log(np.swapaxes(before[:, :3, :3], 1, 2) @ after[:, :3, :3]) / (2 * h)
+    before, now, after = (poses_at(times_s + dt, tilt) for dt in (-h, 0, h))
+    gyro = so3_log(np.swapaxes(before[:, :3, :3], 1, 2) @ after[:, :3, :3]) / (2 * h)
     velocity = (after[:, :3, 3] - before[:, :3, 3]) / (2 * h)
     acceleration = (after[:, :3, 3] - 2 * now[:, :3, 3] + before[:, :3, 3]) / h**2
-    force: FloatArray = np.einsum("nji,nj->ni", now[:, :3, :3], acceleration - G)
+    R_base_map = np.swapaxes(now[:, :3, :3], 1, 2)
+    force: FloatArray = (R_base_map @ (acceleration - G)[:, :, None])[:, :, 0]
     return gyro, force, velocity
 
 
@@ -74,6 +75,7 @@ class World:
     noise_px: float = 0.0
     seed: int = 0
     start_s: float = 0.0
+    tilt: float = 1.0
     late_s: float = 0.0  # how long after its stamp an image was really taken
     kind: str = "brisk"
     mission: str = MISSION
@@ -83,12 +85,12 @@ class World:
     def __post_init__(self) -> None:
         rng = np.random.default_rng(self.seed)
         self.points = rng.uniform([4, -4, -2.5], [8, 4, 2.5], (self.num_points, 3))
-        self.times_s = self.start_s + self.step_s * np.arange(self.num_vertices)
+        self.times_s = self.start_s + self.step_s * np.arange(self.num_vertices, dtype=np.float64)
         self.rng = rng
 
     @property
     def poses(self) -> FloatArray:
-        return poses_at(self.times_s)
+        return poses_at(self.times_s, self.tilt)
 
     @property
     def stamps_ns(self) -> IntArray:
@@ -139,7 +141,7 @@ class World:
     def _pictured(
         self, camera: Camera, at_s: FloatArray
     ) -> tuple[FloatArray, BoolArray, FloatArray]:
-        T = poses_at(at_s) @ camera.T_base_sensor.matrix
+        T = poses_at(at_s, self.tilt) @ camera.T_base_sensor.matrix
         p = np.einsum("nji,nj->ni", T[:, :3, :3], self.points - T[:, :3, 3])
         return *project(camera.calibration, p), p
 
@@ -180,14 +182,14 @@ class World:
         map_ = append_edges(map_, edges)
         per = round(self.step_s * rate_hz) + 1
         times = (self.times_s[:-1, None] + np.linspace(0, self.step_s, per)).ravel()
-        gyro, force, _ = imu_at(times)
+        gyro, force, _ = imu_at(times, self.tilt)
         samples = ImuSamples(
             edge=first_edge + np.repeat(np.arange(num), per),
             stamp_ns=np.rint(times * 1e9).astype(np.int64) + 1_000_000_000,
             gyro_radps=gyro,
             accel_mps2=force,
         )
-        _, _, velocities = imu_at(self.times_s)
+        _, _, velocities = imu_at(self.times_s, self.tilt)
         described = json.loads(map_.missions.sensors[0]) | {
             "imu": {"gyro_density": 1e-4, "accel_density": 1e-3, "gyro_random_walk": 1e-6, "accel_random_walk": 1e-5}
         }  # fmt: skip
@@ -200,10 +202,10 @@ class World:
 
 
 def with_true_landmarks(world: World, map_: Map, kind: str = "brisk") -> Map:
-    """Return the map with a landmark where each point is, seen by all observations of its track."""
+    """Return the map, whose poses are true, with a landmark where each point is, seen by all of its track."""
     seen = np.unique(map_.observations.track)
     homes = np.array([map_.observations.vertex[map_.observations.track == t][0] for t in seen])
-    T = invert(world.poses[homes])
+    T = invert(map_.T_map_base(homes))
     p = np.einsum("nij,nj->ni", T[:, :3, :3], world.points[seen]) + T[:, :3, 3]
     added = Landmarks(
         id=id_array(derived_id("landmark", int(t)) for t in seen),

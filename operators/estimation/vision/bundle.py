@@ -197,7 +197,7 @@ def _sensors(
         camera = cameras.get((mission, name))
         state = SensorState(place, camera.calibration if camera else None)
         keys: dict[str, int] = {}
-        if camera is not None:
+        if camera is not None and name in (config.refined_cameras or (name,)):
             number = number_of[mission, name]
             if "extrinsics" in config.refine:
                 keys["mount_key"] = key_of("camera", number)

