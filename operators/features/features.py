@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from threading import local
-from typing import ClassVar, Literal
-
-import cv2
+from typing import Literal
 
 from mapstream.operators.features.detectors import (
     Detector,
@@ -14,9 +11,9 @@ from mapstream.operators.features.detectors import (
     DetectorOptions,
     make_detector,
 )
-from mapstream.operators.features.gray import gray, wrong_size
-from mapstream.operators.operator import Operator, Placement, pipeline, report_loss, warn
-from mapstream.streams.channel import Receiver, Sender
+from mapstream.operators.features.finder import FeatureFinder
+from mapstream.operators.features.gray import gray
+from mapstream.operators.features.rows import features_in
 from mapstream.streams.messages.sensors import CameraFrame
 from mapstream.streams.messages.vision import ImageFeatures
 
@@ -34,38 +31,12 @@ class OrbConfig(FeaturesConfig):
     kind: Literal["orb"] = "orb"
 
 
-@dataclass(frozen=True)
-class Inputs:
-    frames: Receiver[CameraFrame]
-
-
-@dataclass(frozen=True)
-class Outputs:
-    features: Sender[ImageFeatures]  # one per image, even without a keypoint
-
-
-class Features(Operator[Inputs, Outputs]):
+class Features(FeatureFinder):
     """Detect and describe keypoints: the strongest, spread over the image, none close to another."""
-
-    placement: ClassVar[Placement] = "thread"
 
     def __init__(self, config: FeaturesConfig) -> None:
         self._config = config
         self._of_thread = local()  # a detector that workers share is not safe
-
-    async def run(self, inputs: Inputs, outputs: Outputs) -> None:
-        cv2.setNumThreads(1)  # operators run beside each other
-
-        async def send(result: ImageFeatures | _Refused) -> None:
-            if isinstance(result, _Refused):
-                report_loss(result.reason)
-                outputs.features.advance(result.stamp_ns)
-                return
-            if len(result) == 0:
-                warn(f"images of {result.frame} without a keypoint: too dark, or without texture")
-            await outputs.features.send(result)
-
-        await pipeline(self._looked_at, inputs.frames, send)
 
     def detect(self, frame: CameraFrame) -> ImageFeatures:
         """Find the keypoints of one image, the strongest first."""
@@ -74,24 +45,16 @@ class Features(Operator[Inputs, Outputs]):
             detector = make_detector(self._config.kind, self._config)
             self._of_thread.detector = detector
         found = detector.detect(gray(frame))
-        return ImageFeatures(
-            stamp_ns=frame.stamp_ns,
-            kind=self._config.kind,
-            frame=frame.frame,
-            keypoints_px=found.px,
+        return features_in(
+            frame,
+            self._config.kind,
+            found.px,
             descriptors=found.descriptors,
             scores=found.scores,
             scales=found.scales,
             orientations_rad=found.orientations_rad,
             sigmas_px=found.sigmas_px,
-            T_base_sensor=frame.T_base_sensor,
-            camera=frame.camera,
-            record=frame.record,
         )
-
-    def _looked_at(self, frame: CameraFrame) -> ImageFeatures | _Refused:
-        reason = wrong_size(frame)
-        return self.detect(frame) if reason is None else _Refused(frame.stamp_ns, reason)
 
 
 class Orb(Features):
@@ -99,9 +62,3 @@ class Orb(Features):
 
     def __init__(self, config: OrbConfig) -> None:
         super().__init__(config)
-
-
-@dataclass(frozen=True, slots=True)
-class _Refused:
-    stamp_ns: int
-    reason: str

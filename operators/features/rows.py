@@ -1,4 +1,4 @@
-"""Some keypoints of a message, or those of two: all that is known of each stays with it."""
+"""Keypoints of an image, some of a message, or those of two: all that is known of each stays with it."""
 
 from __future__ import annotations
 
@@ -8,6 +8,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from mapstream.streams.arrays import Float32Array
+from mapstream.streams.messages.sensors import CameraFrame
 from mapstream.streams.messages.vision import ImageFeatures
 
 _OPTIONAL = (
@@ -20,6 +22,25 @@ _OPTIONAL = (
     "point_sigmas_m",
     "offsets_ns",
 )
+
+
+def features_in(
+    frame: CameraFrame,
+    kind: str,
+    px: Float32Array,
+    **known: Any,  # noqa: ANN401  # fields of ImageFeatures
+) -> ImageFeatures:
+    """Return keypoints (N, 2) of an image, with what is known of each; camera, place and record are the image's."""
+    return ImageFeatures(
+        stamp_ns=frame.stamp_ns,
+        kind=kind,
+        frame=frame.frame,
+        keypoints_px=px,
+        T_base_sensor=frame.T_base_sensor,
+        camera=frame.camera,
+        record=frame.record,
+        **known,
+    )
 
 
 def rows_of(features: ImageFeatures, rows: npt.NDArray[Any]) -> ImageFeatures:

@@ -2,25 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import ClassVar
-
 import anyio.to_thread
-import cv2
 import numpy as np
 from pydantic import Field, PositiveFloat, PositiveInt
 
-from mapstream.operators.features.gray import gray, wrong_size
+from mapstream.operators.features.finder import FeatureFinder, Inputs, Outputs
+from mapstream.operators.features.gray import gray
+from mapstream.operators.features.rows import features_in
 from mapstream.operators.networks.keypoints import KeypointNetwork
-from mapstream.operators.operator import (
-    Operator,
-    OperatorConfig,
-    Placement,
-    offload,
-    report_loss,
-    warn,
-)
-from mapstream.streams.channel import Receiver, Sender
+from mapstream.operators.operator import OperatorConfig
 from mapstream.streams.messages.sensors import CameraFrame
 from mapstream.streams.messages.vision import ImageFeatures
 
@@ -36,54 +26,31 @@ class LearnedConfig(OperatorConfig):
     """Uncertainty of a keypoint at scale 1."""
 
 
-@dataclass(frozen=True)
-class Inputs:
-    frames: Receiver[CameraFrame]
-
-
-@dataclass(frozen=True)
-class Outputs:
-    features: Sender[ImageFeatures]  # one per image, even without a keypoint
-
-
-class LearnedFeatures(Operator[Inputs, Outputs]):
+class LearnedFeatures(FeatureFinder):
     """Find keypoints with a network."""
-
-    placement: ClassVar[Placement] = "thread"
 
     def __init__(self, config: LearnedConfig) -> None:
         self._sigma_px = config.sigma_px / config.image_scale
+        self._network: KeypointNetwork | None = None
 
     def open(self) -> KeypointNetwork:
         """Return the network, ready to run."""
         raise NotImplementedError
 
     async def run(self, inputs: Inputs, outputs: Outputs) -> None:
-        cv2.setNumThreads(1)  # operators run beside each other
-        network = await anyio.to_thread.run_sync(self.open)
-        async for frame in inputs.frames:
-            reason = wrong_size(frame)
-            if reason is not None:
-                report_loss(reason)
-                outputs.features.advance(frame.stamp_ns)
-                continue
-            found = await offload(self.detect, network, frame)
-            if len(found) == 0:
-                warn(f"images of {found.frame} without a keypoint: too dark, or without texture")
-            await outputs.features.send(found)
+        self._network = await anyio.to_thread.run_sync(self.open)
+        await super().run(inputs, outputs)
 
-    def detect(self, network: KeypointNetwork, frame: CameraFrame) -> ImageFeatures:
+    def detect(self, frame: CameraFrame) -> ImageFeatures:
         """Find the keypoints of one image, the best first."""
+        network = self._network or self.open()
         found = network.find(gray(frame))
-        return ImageFeatures(
-            stamp_ns=frame.stamp_ns,
-            kind=network.kind,
-            frame=frame.frame,
-            keypoints_px=found.px,
+        sigmas_px = np.full(len(found.px), self._sigma_px, np.float32)
+        return features_in(
+            frame,
+            network.kind,
+            found.px,
             descriptors=found.descriptors,
             scores=found.scores,
-            sigmas_px=np.full(len(found.px), self._sigma_px, np.float32),
-            T_base_sensor=frame.T_base_sensor,
-            camera=frame.camera,
-            record=frame.record,
+            sigmas_px=sigmas_px,
         )

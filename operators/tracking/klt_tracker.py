@@ -9,7 +9,7 @@ from pydantic import Field, PositiveFloat
 
 from mapstream.operators.features.corners import corners
 from mapstream.operators.features.gray import GrayImage, gray
-from mapstream.operators.features.rows import rows_of
+from mapstream.operators.features.rows import features_in, rows_of
 from mapstream.operators.operator import warn
 from mapstream.operators.tracking.live_tracks import LiveTracks
 from mapstream.operators.tracking.optical_flow import FlowOptions, follow
@@ -19,7 +19,7 @@ from mapstream.operators.tracking.track_ids import TrackNumbers
 from mapstream.operators.tracking.turning import turned_px
 from mapstream.operators.tracking.two_point import OutlierOptions, agreeing
 from mapstream.operators.tracking.upkeep import TrackLimits, admitted, survivors
-from mapstream.streams.arrays import Float32Array, FloatArray
+from mapstream.streams.arrays import FloatArray
 from mapstream.streams.messages.sensors import CameraFrame
 from mapstream.streams.messages.vision import ImageFeatures
 
@@ -105,8 +105,10 @@ class KltTracker:
         shifts_px = np.where(good[:, None], px - left_px, np.float32(np.nan))
         self._live = replace(live, right_shifts_px=shifts_px)
         found = rows_of(live.features, good)
-        return replace(
-            _features(right, px[good], found.kind),
+        return features_in(
+            right,
+            found.kind,
+            px[good],
             scores=found.scores,
             sigmas_px=found.sigmas_px,
             track_ids=found.track_ids,
@@ -117,7 +119,7 @@ class KltTracker:
     ) -> LiveTracks:
         """Return the tracks of the image before that are found in this one."""
         config, before, live = self._config, self._image, self._live
-        none = _features(frame, _NO_PX, "klt" if live is None else live.features.kind)
+        none = features_in(frame, "klt" if live is None else live.features.kind, _NO_PX)
         if live is None or before is None:
             return LiveTracks.new(none)
         if before.shape != image.shape:
@@ -137,7 +139,7 @@ class KltTracker:
         px, scores = corners(image, config.min_corner_quality, config.min_distance_px)
         if len(px) == 0:
             warn(f"images of {frame.frame} without a corner: too dark, or without texture")
-        return replace(_features(frame, px, "klt"), scores=scores)
+        return features_in(frame, "klt", px, scores=scores)
 
     def _joined(self, live: LiveTracks, detections: ImageFeatures, image: GrayImage) -> LiveTracks:
         """Return the tracks and new ones."""
@@ -155,16 +157,3 @@ class KltTracker:
             sigmas_px = np.full(len(new), self._config.sigma_px, np.float32)
         numbers = self._numbers.take(len(new))
         return live.joined_by(replace(new, track_ids=numbers, sigmas_px=sigmas_px))
-
-
-def _features(frame: CameraFrame, px: Float32Array, kind: str) -> ImageFeatures:
-    """Return keypoints (N, 2) of an image, of which nothing else is known."""
-    return ImageFeatures(
-        stamp_ns=frame.stamp_ns,
-        kind=kind,
-        frame=frame.frame,
-        keypoints_px=px,
-        T_base_sensor=frame.T_base_sensor,
-        camera=frame.camera,
-        record=frame.record,
-    )
