@@ -11,7 +11,13 @@ from typing import Annotated
 import typer
 
 from mapstream.graph.cli.dataset_cache import converted
-from mapstream.graph.cli.evaluate import compare
+from mapstream.graph.cli.demo_judges import (
+    Judge,
+    Judgement,
+    against_end_of_v101,
+    against_truth,
+    against_unused_positions,
+)
 from mapstream.graph.cli.output import (
     ExitCode,
     JsonFlag,
@@ -26,21 +32,9 @@ from mapstream.graph.cli.run_report import print_report, report_as_json
 from mapstream.graph.cli.running import execute
 from mapstream.graph.cli.simulate import write_world
 from mapstream.graph.problems import did_you_mean
-from mapstream.graph.trajectory_sources import read_trajectory
-from mapstream.graph.unused_positions import unused_position_errors
-from mapstream.recordings.evaluation import Statistics
 from mapstream.recordings.maps import check_map, load_map
 from mapstream.recordings.worlds.catalogue import WORLDS
 from mapstream.streams.errors import ConfigError
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Judgement:
-    """How far the map is from what it is judged by."""
-
-    against: str
-    distance_m: Statistics
-    length_m: float
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -50,20 +44,8 @@ class Demo:
     summary: str
     record: Callable[[Path, int], Path]  # a folder and a seed -> the recording
     graph: str
-    judge: Callable[[Path, Path], Judgement]  # the map's folder and the recording
+    judge: Judge
     params: Callable[[Path], dict[str, str]] = lambda _: {}  # of the graph, for the recording
-
-
-def _against_truth(folder: Path, recording: Path) -> Judgement:
-    score = compare(read_trajectory(folder), read_trajectory(recording), "se3")
-    error = score.errors["absolute, translation [m]"]
-    return Judgement(against="the truth", distance_m=error, length_m=score.length_m)
-
-
-def _against_unused_positions(folder: Path, recording: Path) -> Judgement:
-    found = unused_position_errors(load_map(folder), recording)
-    against = f"{found.distance_m.count} GPS positions that were not used, {found.num_used} were"
-    return Judgement(against=against, distance_m=found.distance_m, length_m=found.length_m)
 
 
 def _corridor(folder: Path, seed: int) -> Path:
@@ -77,6 +59,10 @@ def _kitti00(folder: Path, seed: int) -> Path:  # noqa: ARG001  # it lies in the
     return converted("kitti00-gtsam")
 
 
+def _euroc(folder: Path, seed: int) -> Path:  # noqa: ARG001  # as above
+    return converted("eqvio")
+
+
 def _inertial_params(recording: Path) -> dict[str, str]:  # noqa: ARG001  # as other demos ask it
     """Return how few positions are used; the others judge the map, for so few cannot judge each other."""
     return {"position_period_s": "10"}
@@ -87,14 +73,20 @@ DEMOS = {
         summary="a real car, KITTI 00: IMU, and GPS every ten seconds",
         record=_kitti00,
         graph="gnss_inertial",
-        judge=_against_unused_positions,
+        judge=against_unused_positions,
         params=_inertial_params,
+    ),
+    "euroc": Demo(
+        summary="a real drone, EuRoC V1_01: 30 s of feature tracks of one camera, and IMU",
+        record=_euroc,
+        graph="tracks_inertial",
+        judge=against_end_of_v101,
     ),
     "corridor": Demo(
         summary="a simulated LiDAR in a loop of corridors",
         record=_corridor,
         graph="lidar",
-        judge=_against_truth,
+        judge=against_truth,
     ),
 }
 
@@ -108,6 +100,10 @@ def demo(
         Path | None, typer.Option("--out", help="A folder for the results; a new one without.")
     ] = None,
     seed: Annotated[int, typer.Option(help="Of a simulation.")] = 0,
+    truth: Annotated[
+        Path | None,
+        typer.Option(help="Judge by this instead: a TUM, KITTI or EuRoC file, or a recording."),
+    ] = None,
     rerun: Annotated[
         str | None,
         typer.Option("--rerun", help="spawn, connect, save=FILE or off; a file in OUT without."),
@@ -136,7 +132,9 @@ def demo(
         print_report(report)
         raise typer.Exit(report.exit_code)
     violations = check_map(load_map(map_folder), map_folder)
-    judgement = chosen.judge(map_folder, recording)
+    judgement = (
+        chosen.judge(map_folder, recording) if truth is None else against_truth(map_folder, truth)
+    )
     if json:
         results = {"folder": folder, "recording": recording, "judgement": judgement}
         say_json(report_as_json(report) | results | {"violations": violations, "viewer": notes})

@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 
 from mapstream.graph.cli.dataset_cache import converted
+from mapstream.graph.cli.demo_judges import against_end_of_v101
 from mapstream.graph.unused_positions import unused_position_errors
 from mapstream.recordings.cache import cache_folder
-from mapstream.recordings.maps import Map
+from mapstream.recordings.maps import Map, save_map
 from mapstream.recordings.maps.build import append_edges, new_mission
 from mapstream.recordings.maps.ids import derived_id, id_array, mission_id
 from mapstream.recordings.maps.model import vertex_ids
@@ -20,6 +21,7 @@ from mapstream.recordings.mcap_writer import McapWriter
 from mapstream.streams.errors import EstimationError, RecordingError
 from mapstream.streams.geometry import SE3
 from mapstream.streams.messages.constraints import Constraint, OuterFrame
+from tests.data import shared
 from tests.graph.terminal import Terminal
 
 SECOND = 1_000_000_000
@@ -118,6 +120,32 @@ def test_a_map_that_used_all_positions_cannot_be_judged(tmp_path: Path) -> None:
 
     with pytest.raises(EstimationError, match="no position is left to judge by: of 0 in frames"):
         unused_position_errors(straight_map(0), file)
+
+
+@pytest.mark.slow
+def test_demo_euroc_maps_a_real_drone_within_10_cm(mapstream: Terminal, tmp_path: Path) -> None:
+    """Feature tracks of one camera and an IMU, 30 s, against the re-estimated truth."""
+    truth = shared("euroc_v101_stereo_imu") / "gt_V1_01_easy_openvins.csv"
+
+    done = mapstream(
+        "demo", "euroc", "--out", tmp_path, "--rerun", "off", "--truth", truth, "--json"
+    )
+
+    assert done.code == 0, done.err
+    judgement = done.json["judgement"]
+    assert judgement["against"] == "the truth"
+    assert judgement["distance_m"]["rmse"] < 0.1
+    assert judgement["length_m"] > 7
+    assert done.json["violations"] == []
+
+
+def test_without_truth_the_drone_is_judged_by_where_it_ends(tmp_path: Path) -> None:
+    save_map(straight_map(), tmp_path)
+
+    judgement = against_end_of_v101(tmp_path, tmp_path)
+
+    assert judgement.distance_m.rmse == pytest.approx(10 - 2.771)
+    assert judgement.length_m == pytest.approx(10)
 
 
 def test_an_unknown_demo_is_refused_with_what_there_is(mapstream: Terminal) -> None:
