@@ -7,24 +7,19 @@ Where nothing was measured through the gap, or that is wanted, the mission ends 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 from pydantic import model_validator
 
-from mapstream.operators.maps.composing import Motion, composed
 from mapstream.operators.maps.landmark_homes import rehomed, without_vertices
+from mapstream.operators.maps.linking import linked
 from mapstream.operators.maps.split import split_mission
 from mapstream.operators.operator import OperatorConfig
-from mapstream.recordings.maps.build import append_edges
 from mapstream.recordings.maps.combine import select_missions
-from mapstream.recordings.maps.edge_kinds import MOTION_KINDS
 from mapstream.recordings.maps.model import Map
-from mapstream.recordings.maps.rows import concatenate, take
 from mapstream.recordings.maps.structure_rules import components
-from mapstream.recordings.maps.tables import Edges
-from mapstream.streams.arrays import IntArray
 from mapstream.streams.errors import MapError
 
 _MAX_NS = 2**63 - 1
@@ -86,12 +81,12 @@ def remove_range(map_: Map, mission_row: int, gap: Gap) -> tuple[Map, RemovalRep
         raise MapError(f"nothing of mission {name} would be left; remove the mission")
     first, last = np.flatnonzero(goes)[[0, -1]]
     is_inside = first > 0 and last < len(rows) - 1
-    linked, num_links, new = map_, 0, tuple[str, ...]()
+    over, num_links, new = map_, 0, tuple[str, ...]()
     if is_inside and gap.across == "link":
-        linked, num_links = _linked(map_, rows[first - 1 : last + 2])
+        over, num_links = linked(map_, [rows[first - 1 : last + 2]])
     keep = np.ones(len(map_.vertices), dtype=bool)
     keep[rows[goes]] = False
-    left = without_vertices(linked, keep)
+    left = without_vertices(over, keep)
     if is_inside and gap.across == "split":
         left, mission_id = split_mission(left, mission_row, int(stamps_ns[last + 1]))
         new = (mission_id,)
@@ -113,66 +108,3 @@ def _split_where_apart(map_: Map, mission_row: int) -> tuple[Map, tuple[str, ...
         map_, mission_id = split_mission(map_, mission_row, starts_ns)
         new.append(mission_id)
         mission_row = map_.mission_row(mission_id)
-
-
-def _linked(map_: Map, stretch: IntArray) -> tuple[Map, int]:
-    """Return the map with edges from the first to the last vertex of a stretch, and how many there are."""
-    num_edges = len(map_.edges)
-    position = np.full(len(map_.vertices) + 1, -1)  # the last is that of no vertex
-    position[stretch] = np.arange(len(stretch))
-    edges = map_.edges
-    start, end = position[edges.vertex_a], position[edges.vertex_b]
-    is_inside = (start >= 0) & (end > start)
-    for kind, source in sorted(
-        set(zip(edges.kind[is_inside], edges.source[is_inside], strict=True))
-    ):
-        rows = np.flatnonzero(is_inside & (edges.kind == kind) & (edges.source == source))
-        path = _path(dict(zip(start[rows].tolist(), rows.tolist(), strict=True)), end, len(stretch))
-        if len(path) < 2:
-            continue
-        if kind in MOTION_KINDS:
-            map_ = _with_motion(map_, path)
-        elif kind == "imu":
-            map_ = _with_imu(map_, path)
-    return map_, len(map_.edges) - num_edges
-
-
-def _path(leaving: dict[int, int], end: IntArray, length: int) -> list[int]:
-    """Return the rows of edges that lead from position 0 to the last one; empty where none do."""
-    path, at = list[int](), 0
-    while at < length - 1:
-        row = leaving.get(at)
-        if row is None:
-            return []
-        path.append(row)
-        at = int(end[row])
-    return path
-
-
-def _over(map_: Map, path: list[int]) -> Edges:
-    """Return the edge from the first end of a path to its last, with all else from its first edge."""
-    first = take(map_.edges, np.array(path[:1]))
-    return replace(first, vertex_b=map_.edges.vertex_b[path[-1:]])
-
-
-def _with_motion(map_: Map, path: list[int]) -> Map:
-    edges = map_.edges
-    motion = composed(Motion(edges.T_a_b_of(row), edges.covariance[row]) for row in path)
-    over = replace(
-        _over(map_, path),
-        T_a_b=motion.T.matrix[None],
-        covariance=motion.covariance[None],
-        switch=edges.switch[path].min(keepdims=True),
-    )
-    return append_edges(map_, over)
-
-
-def _with_imu(map_: Map, path: list[int]) -> Map:
-    """Join the samples of IMU edges; the one at a vertex ends one edge and begins the next."""
-    samples = concatenate([take(map_.imu, map_.imu.edge == row) for row in path])
-    is_new = np.diff(samples.stamp_ns, prepend=-1) > 0
-    joined = take(samples, is_new)
-    row = len(map_.edges)
-    moved = replace(joined, edge=np.full(len(joined), row))
-    map_ = append_edges(map_, _over(map_, path))
-    return replace(map_, imu=concatenate([map_.imu, moved]))
