@@ -3,43 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 
 import numpy as np
 
+from mapstream.operators.backend.holds import all_holds, new_holds
 from mapstream.operators.estimation.batch import (
     OptimizationReport,
     OptimizeConfig,
     optimize_map,
 )
 from mapstream.operators.estimation.factors.inertial import outdated
-from mapstream.operators.estimation.gauge import gauge_factors
 from mapstream.operators.estimation.incremental import IncrementalProblem
 from mapstream.operators.estimation.kinds import make_factors
 from mapstream.operators.estimation.noise import Factor, NoiseModels
-from mapstream.operators.estimation.outliers.absolute_outliers import reject_absolute
-from mapstream.operators.estimation.outliers.innovations import Judge, review, take_in
-from mapstream.operators.estimation.outliers.lonely_fixes import (
-    false_fixes,
-    far_off,
-    lonely_fixes,
-    switched,
-)
-from mapstream.operators.estimation.priors import prior_factors
+from mapstream.operators.estimation.outliers.fix_judge import FixJudge, with_verdicts
+from mapstream.operators.estimation.outliers.lonely_fixes import lonely_fixes
 from mapstream.operators.estimation.problem import with_loss
-from mapstream.operators.estimation.starts.first_fixes import (
-    FEWEST_FIXES,
-    FirstFixes,
-    headed,
-    inertial_missions,
-    is_linked,
-    reconsidered,
-)
-from mapstream.operators.estimation.starts.inertial_start import (
-    dead_reckoned,
-    first_velocity_prior,
-    with_known_biases,
-)
+from mapstream.operators.estimation.starts.first_fixes import FirstFixes, headed, is_linked
+from mapstream.operators.estimation.starts.inertial_start import dead_reckoned, with_known_biases
 from mapstream.operators.estimation.states import initial_values, with_solution
 from mapstream.operators.estimation.symbols import PoseSymbols
 from mapstream.recordings.maps.build import add_edges, anchored
@@ -53,7 +34,6 @@ from mapstream.streams.geometry import SE3
 from mapstream.streams.messages.estimates import MapCorrection, RelativePose, Submap
 
 _CONSISTENT_CHI2 = 16.8  # per loop: 99 % of a chi2 with six degrees of freedom
-_FIRST_IF_FALSE = 12  # fixes that say how a mission heads, where some of them are false
 
 
 class LiveMap:
@@ -64,8 +44,8 @@ class LiveMap:
     Loops enter as plain factors, since a robust cost would throw out a true loop that contradicts drift.
     When the loops contradict each other or the rest, the batch solver says which are false, and their
     factors leave the problem; they stay in the map with the switch that they got.
-    Where absolute measurements may be false, those on missions that only an IMU leads along are judged one by one
-    before they enter the problem, and all of them again at the end.
+    Where absolute measurements may be false, those on missions that only an IMU leads along enter once it is sure
+    that they are true (`fix_judge.py`), and leave when later ones say otherwise; the others are switched off.
     """
 
     def __init__(self, config: OptimizeConfig, T_map_first: SE3 | None = None) -> None:
@@ -77,7 +57,8 @@ class LiveMap:
         self._symbols = PoseSymbols()
         self._noise_of = NoiseModels()
         self._seen: set[bytes] = set()  # ids of edges that are in the problem, or were found false
-        self._fixes = FirstFixes(_FIRST_IF_FALSE if config.reject_absolute else FEWEST_FIXES)
+        self._fixes = FirstFixes()
+        self._judge = FixJudge() if config.reject_absolute else None
         self._newest: dict[str, SE3] = {}  # mission -> T_odom_base of its newest vertex
 
     def ordered(self) -> Map:
@@ -123,33 +104,14 @@ class LiveMap:
         Raises:
             EstimationError: If the map has no finite solution.
         """
-        if self._config.reject_absolute:
-            self._fixes.meet_few()
-            self._solve_with(np.empty(0, dtype=np.int64))
-            self._reconsider()
+        if self._judge is not None:
+            self._solve_with(np.empty(0, dtype=np.int64), is_whole=True)
         self.map = self.ordered()
         return self._optimize()
 
-    def _reconsider(self) -> None:
-        """Judge fixes by the whole drive: a false one that came in may have kept true ones out."""
-        if not self._seen & self._doubtful:
-            return
-        fixes = np.array(list(lonely_fixes(self.map).values()), dtype=np.int64)
-        for mission in sorted(inertial_missions(self.map)):
-            self.map = reconsidered(self.map, mission, self._doubted)
-        self.map = switched(self.map, fixes.tolist(), 1.0)
-        self.map = switched(self.map, far_off(self.map, fixes), 0.0)
-        self._start_anew()
-        self._judge(review)
-
     def _optimize(self) -> OptimizationReport:
-        """Solve the whole map; fixes on missions that only an IMU leads along are as they were judged."""
-        if self._config.reject_absolute:
-            linked = set(range(len(self.map.missions))) - inertial_missions(self.map)
-            self.map, _ = reject_absolute(self.map, missions=linked)
-        config = self._config.model_copy(update={"reject_absolute": False})
-        self.map, report = optimize_map(self.map, config)
-        return replace(report, rejected_absolute=false_fixes(self.map))
+        self.map, report = optimize_map(self.map, self._config)
+        return report
 
     def correction(self, mission_id: str) -> MapCorrection:
         """Return the present poses of a mission, and where its odometry frame lies."""
@@ -175,14 +137,14 @@ class LiveMap:
         """Return the row of each edge by the name of its factor, which is the edge's id."""
         return {name: at for at, name in enumerate(as_keys(self.map.edges.id).tolist())}
 
-    def _solve_with(self, new_vertices: IntArray) -> None:
-        """Bring the problem to the edges of the map, and take its solution."""
-        rows = self._names()
-        gone = self._seen - rows.keys()
-        self._seen -= gone
+    def _solve_with(self, new_vertices: IntArray, *, is_whole: bool = False) -> None:
+        """Bring the problem to the edges of the map, of which no more come if it is whole; take its solution."""
         self.map = with_known_biases(self.map, new_vertices)
+        rows, off = self._names(), self._switch_fixes(is_whole=is_whole)
+        gone = (self._seen - rows.keys()) | (self._seen & off)
+        self._seen -= gone
         meeting = [f for f in self._fixes.meet(self.map) if not is_linked(self.map, f)]
-        fresh = {name: row for name, row in rows.items() if name not in self._seen}
+        fresh = {n: row for n, row in rows.items() if n not in self._seen and n not in off}
         waiting = self._fixes.waiting(self.map, fresh.values())
         named = self._made([row for row in fresh.values() if row not in waiting])
         inertial = {rows[n]: f for n, f in named.items() if self.map.edges.kind[rows[n]] == "imu"}
@@ -192,22 +154,23 @@ class LiveMap:
         self._seen |= named.keys()
         if meeting:
             for fixes in meeting:
-                self.map = headed(self.map, fixes, self._doubted)
-                if self._config.reject_absolute:
-                    self.map = switched(self.map, far_off(self.map, fixes), 0.0)
+                self.map = headed(self.map, fixes, self._softened)
             self._start_anew()
-            self._judge(review)
-            return
-        if not named and not gone:
-            return
-        added = named | self._holds({rows[n]: f for n, f in named.items()}, new_vertices)
-        values = initial_values(self.map, self._problem.new_keys(added.values()))
-        doubtful = self._doubtful & added.keys()
-        certain = {name: factor for name, factor in added.items() if name not in doubtful}
-        self._problem.update(values, certain, sorted(gone & self._problem.factors.keys()))
-        self._judge(take_in, doubtful)
-        self._take()
-        self._integrate_anew(rows)
+        elif named or gone:
+            held = self._holds({rows[n]: f for n, f in named.items()}, new_vertices)
+            values = initial_values(self.map, self._problem.new_keys((named | held).values()))
+            gone &= self._problem.factors.keys()
+            self._problem.update(values, named | held, sorted(gone))
+            self._take()
+            self._integrate_anew(rows)
+
+    def _switch_fixes(self, *, is_whole: bool) -> set[bytes]:
+        """Switch fixes by what is known of them now, where only an IMU leads; return those that are off."""
+        if self._judge is None:
+            return set()
+        self.map = with_verdicts(self.map, self._judge.verdicts(self.map, is_whole=is_whole))
+        fixes, edges = lonely_fixes(self.map), self.map.edges
+        return set(as_keys(edges.id[fixes[edges.switch[fixes] == 0]]).tolist())
 
     def _mission_of(self, edge: int) -> int:
         vertex = self.map.edges.vertex_a[edge]
@@ -227,45 +190,11 @@ class LiveMap:
             return factor
         return with_loss(factor, loss, widening * self._config.loss_width)
 
-    def _doubted(self, row: int, factor: Factor, widening: float) -> Factor:
-        """Return the factor under its loss, as wide as that; fixes that may be false have one."""
-        if self._config.reject_absolute and self.map.edges.kind[row] == "position":
-            return with_loss(factor, "geman_mcclure", widening * self._config.loss_width)
-        return self._softened(row, factor, widening)
-
-    @property
-    def _doubtful(self) -> set[bytes]:
-        """The edges that may be false, where only an IMU can tell."""
-        return set(lonely_fixes(self.map)) if self._config.reject_absolute else set()
-
-    def _judge(self, judge: Judge, names: set[bytes] | None = None) -> None:
-        """Let these measurements in, or all that were seen, unless the others contradict them."""
-        known = self._seen if names is None else names
-        fixes = lonely_fixes(self.map) if known else {}  # looking for them reads all edges
-        rows = {name: row for name, row in fixes.items() if name in known}
-        if not rows:
-            return
-        made = self._made(list(rows.values()))
-        false = judge(self._problem, {name: made[name] for name in rows})
-        self.map = switched(self.map, list(rows.values()), 1.0)
-        self.map = switched(self.map, [rows[name] for name in false], 0.0)
-        self._take()
-
     def _holds(self, factors: dict[int, Factor], new_vertices: IntArray) -> dict[bytes, Factor]:
         """Return what holds missions that begin here, and weak priors on new variables of other kinds."""
         missions = np.unique(self.map.vertices.mission[new_vertices]).tolist()
         begun = [m for m in missions if self.map.mission_id(m) not in self._newest]
-        firsts = {int(self.map.vertices_of(mission)[0]) for mission in begun}
-        holds = gauge_factors(self.map, factors) if firsts else []
-        holds = [factor for factor in holds if factor.keys()[0] in firsts]
-        holds += [first_velocity_prior(self.map, v) for v in firsts & self._inertial_vertices()]
-        new_keys = self._problem.new_keys(factors.values())
-        priors = prior_factors(self.map, factors).items()
-        holds += [factor for key, factor in priors if key in new_keys]
-        return {b"hold%d" % factor.keys()[0]: factor for factor in holds}
-
-    def _inertial_vertices(self) -> set[int]:
-        return set(self.map.edges.vertex_a[self.map.edges_of("imu")].tolist())
+        return new_holds(self.map, factors, begun, self._problem.new_keys(factors.values()))
 
     def _integrate_anew(self, rows: Mapping[bytes, int]) -> None:
         """Replace IMU factors whose bias has moved too far since their samples were integrated."""
@@ -291,13 +220,9 @@ class LiveMap:
         edges = self.map.edges
         is_on = edges.switch >= 0.5
         rows = [at for at, row in enumerate(edges.id) if is_on[at] and row.tobytes() in self._seen]
-        named = self._made(rows)
-        row_of = self._names()
+        named, row_of = self._made(rows), self._names()
         factors = {row_of[name]: factor for name, factor in named.items()}
-        holds = [*gauge_factors(self.map, factors), *prior_factors(self.map, factors).values()]
-        firsts = {int(self.map.vertices_of(m)[0]) for m in range(len(self.map.missions))}
-        holds += [first_velocity_prior(self.map, v) for v in firsts & self._inertial_vertices()]
-        named |= {b"hold%d" % factor.keys()[0]: factor for factor in holds}
+        named |= all_holds(self.map, factors)
         keys = {key for factor in named.values() for key in factor.keys()}  # noqa: SIM118  # gtsam's
         self._problem.reset(initial_values(self.map, keys), named)
         self._take()

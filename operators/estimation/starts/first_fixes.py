@@ -19,7 +19,7 @@ from mapstream.recordings.maps.model import Map
 from mapstream.streams.arrays import IntArray
 from mapstream.streams.errors import EstimationError
 
-FEWEST_FIXES = 4
+_FEWEST_FIXES = 4  # that a mission and a frame must share
 _MIN_SPREAD_M = 10.0
 _LINKS = ("odometry", "wheel", "registration")  # say how the robot moved, however it headed
 _MAX_ITERATIONS = 25
@@ -35,7 +35,6 @@ _WIDENINGS = (
 class FirstFixes:
     """Which missions and frames have met: (row of the mission, row of the frame)."""
 
-    min_fixes: int  # that a mission and a frame must share; more, if some may be false
     met: set[tuple[int, int]] = field(default_factory=set)
 
     def waiting(self, map_: Map, rows: Iterable[int]) -> set[int]:
@@ -50,21 +49,17 @@ class FirstFixes:
         """Return the missions that an IMU leads along alone, and no fixes yet: there is nothing to solve."""
         return inertial_missions(map_) - {mission for mission, _ in self.met}
 
-    def meet_few(self) -> None:
-        """Make do with the fewest fixes that say how a mission heads: no others will come."""
-        self.min_fixes = min(self.min_fixes, FEWEST_FIXES)
-
     def meet(self, map_: Map) -> list[IntArray]:
         """Return the fixes of each mission and frame that meet now, since there are enough of them."""
         edges = map_.edges
-        fixes = np.flatnonzero((edges.kind == "position") & (edges.vertex_a >= 0))
+        is_fix = (edges.kind == "position") & (edges.vertex_a >= 0) & (edges.switch > 0)
         groups: dict[tuple[int, int], list[int]] = {}
-        for row in fixes.tolist():
+        for row in np.flatnonzero(is_fix).tolist():
             groups.setdefault(self._group(map_, row), []).append(row)
         meeting = []
         for group, rows in groups.items():
             spread_m = np.linalg.norm(np.ptp(edges.T_a_b[rows, :3, 3], axis=0))
-            if group not in self.met and len(rows) >= self.min_fixes and spread_m >= _MIN_SPREAD_M:
+            if group not in self.met and len(rows) >= _FEWEST_FIXES and spread_m >= _MIN_SPREAD_M:
                 self.met.add(group)
                 meeting.append(np.array(rows, dtype=np.int64))
         return meeting
@@ -132,19 +127,6 @@ def headed(map_: Map, fixes: IntArray, softened: Softening) -> Map:
     return best.map
 
 
-def reconsidered(map_: Map, mission: int, softened: Softening) -> Map:
-    """Return the map with a mission where most of its fixes have it, whichever of them were taken for false.
-
-    Args:
-        map_: Whose poses are near the solution, but for some stretches.
-        mission: Its row.
-        softened: Puts factors under robust losses.
-    """
-    for widening in _WIDENINGS:
-        map_ = _solved(map_, mission, softened, widening).map
-    return map_
-
-
 @dataclass(frozen=True, slots=True)
 class _Solution:
     map: Map
@@ -152,9 +134,9 @@ class _Solution:
 
 
 def _solved(start: Map, mission: int, softened: Softening, widening: float) -> _Solution:
-    """Return the solution of all that measures one mission alone."""
-    vertex = start.edges.vertex_a
-    rows = np.flatnonzero((vertex >= 0) & (start.vertices.mission[vertex] == mission))
+    """Return the solution of all that measures one mission alone, and is not switched off."""
+    vertex, is_on = start.edges.vertex_a, start.edges.switch > 0
+    rows = np.flatnonzero(is_on & (vertex >= 0) & (start.vertices.mission[vertex] == mission))
     factors = make_factors(start, rows, NoiseModels())
     first = int(start.vertices_of(mission)[0])
     holds = [f for f in gauge_factors(start, factors) if f.keys()[0] == first]
