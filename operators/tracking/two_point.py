@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import PositiveFloat, PositiveInt
 
-from mapstream.operators.operator import OperatorConfig
+from mapstream.operators.operator import OperatorConfig, warn
 from mapstream.operators.tracking.epipolar import off_arc
 from mapstream.streams.arrays import FloatArray
 
@@ -37,6 +37,7 @@ def agreeing(
     """Return which tracks (N,) agree with the translation that most of them agree with.
 
     A point that only turned agrees with every translation, so a camera that stands loses nothing.
+    If no translation has a majority, it is the rotation that is wrong: that is reported, and no track blamed.
 
     Args:
         rays_before: (N, 3) unit rays in the first image.
@@ -66,5 +67,9 @@ def agreeing(
     missed = off_arc(start[rows], rays_now[rows], goals, limit_rad)
     # what many translations fit tells them apart by how well
     best = np.argmin(np.minimum(missed, limit_rad).sum(axis=1))
-    agree[rows] = np.isfinite(missed[best])
+    fits = np.isfinite(missed[best])
+    if 2 * fits.sum() > len(rows):
+        agree[rows] = fits
+    else:
+        warn("most tracks disagree with the gyroscope; are its extrinsics and its clock right?")
     return agree

@@ -14,6 +14,8 @@ from mapstream.operators.operator import Activity, Context
 from mapstream.operators.testing import run_operator
 from mapstream.operators.tracking.descriptor_matching import MatchRules, matched
 from mapstream.operators.tracking.feature_tracker import FeatureTracker, FeatureTrackerConfig
+from mapstream.operators.tracking.klt import Klt
+from mapstream.operators.tracking.klt_tracker import KltConfig
 from mapstream.operators.tracking.track_ids import TrackNumbers, carried_on
 from mapstream.operators.tracking.turning import camera_turn, turned_px
 from mapstream.operators.tracking.two_point import OutlierOptions, agreeing
@@ -179,6 +181,27 @@ def test_D6_a_camera_that_stands_or_only_turns_loses_nothing() -> None:
     for R in (np.eye(3), turn):
         agree = agreeing(_rays(points, rng), _rays(points @ R.T, rng), R, OutlierOptions(), 1)
         assert agree.mean() > 0.98
+
+
+async def test_a_gyroscope_that_is_wrong_is_blamed_instead_of_the_tracks() -> None:
+    views = walk(4, 0.0)
+    rolling = [
+        replace(b, gyro_radps=b.gyro_radps + np.array([1.5, 0, 0])) for b in gyro(views, 0.0)
+    ]
+    activity = Activity()
+
+    out = await run_operator(
+        Klt(KltConfig()),
+        run_context=Context(activity=activity),
+        frames=[view.camera_frame() for view in views],
+        imu=rolling,
+    )
+
+    found = out["features"]
+    assert min(len(_rows(found[i - 1], found[i])[0]) for i in (1, 2, 3)) > 150
+    assert activity.warnings == {
+        "most tracks disagree with the gyroscope; are its extrinsics and its clock right?": 3
+    }
 
 
 def test_carried_on_gives_each_keypoint_a_number_that_no_other_has() -> None:
