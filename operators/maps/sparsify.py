@@ -49,12 +49,12 @@ class SparsifyConfig(OperatorConfig):
 class SparsifyReport:
     """What stayed."""
 
-    num_before: int  # landmarks with observations
-    num_kept: int
-    num_parts: int
-    fewest_before: int  # landmarks of the vertex that has fewest
-    fewest_kept: int
-    num_short: int  # vertices that have fewer than they should and could
+    num_before: int = 0  # landmarks with observations
+    num_kept: int = 0
+    num_parts: int = 0
+    fewest_before: int = 0  # landmarks of the vertex that has fewest
+    fewest_kept: int = 0
+    num_short: int = 0  # vertices that have fewer than they should and could
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -69,14 +69,12 @@ class _Sight:
 
 
 def sparsify(map_: Map, config: SparsifyConfig | None = None) -> tuple[Map, SparsifyReport]:
-    """Return the map with the most useful of its landmarks; landmarks without observations stay.
-
-    Raises:
-        MapError: If no landmark has observations.
-    """
+    """Return the map with the most useful of its landmarks; landmarks without observations stay."""
     config = config or SparsifyConfig()
     sight = _sight(map_, config)
     num = len(sight.landmarks)
+    if not num:
+        return map_, SparsifyReport()
     wanted = min(config.num_landmarks or max(round(config.share * num), 1), num)
     parts = _parts(sight, config)
     kept = np.zeros(num, bool)
@@ -103,8 +101,6 @@ def _sight(map_: Map, config: SparsifyConfig) -> _Sight:
 
     seen = map_.observations
     rows = np.flatnonzero(seen.landmark >= 0)
-    if not len(rows):
-        raise MapError("no landmark has observations: make landmarks from tracks first")
     landmarks, column = np.unique(seen.landmark[rows], return_inverse=True)
     order = np.lexsort((map_.vertices.stamp_ns, map_.vertices.mission))
     place = np.empty(len(order))

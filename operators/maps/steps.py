@@ -9,7 +9,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from importlib import import_module
-from typing import Any, ClassVar, get_type_hints
+from typing import Any, ClassVar, TypeGuard, get_type_hints
 
 from pydantic import BaseModel, Field, ValidationError, model_validator
 
@@ -23,15 +23,18 @@ Tool = Callable[[Map], tuple[Map, Any]]
 
 TOOLS = {
     "anchor_missions": "mapstream.operators.places.anchoring:anchor_missions",
+    "calibrate": "mapstream.operators.estimation.vision.calibration:calibrate",
     "close_visual_loops": "mapstream.operators.places.loops:find_visual_loops",
     "create_landmarks": "mapstream.operators.landmarks.create:create_landmarks",
     "evaluate_quality": "mapstream.operators.landmarks.quality:evaluate_quality",
     "fix_stationary": "mapstream.operators.maps.stationary:fix_stationary",
+    "keyframe": "mapstream.operators.maps.keyframing:keyframe",
     "optimize": "mapstream.operators.estimation.batch:optimize_map",
     "remove_bad_landmarks": "mapstream.operators.landmarks.removal:remove_bad_landmarks",
     "remove_invalid_observations": "mapstream.operators.landmarks.removal:remove_invalid_observations",
     "reset_quality": "mapstream.operators.landmarks.quality:reset_quality",
     "retriangulate": "mapstream.operators.landmarks.create:retriangulate",
+    "sparsify": "mapstream.operators.maps.sparsify:sparsify",
 }
 """By the name that graph files use; what is imported is imported when a graph uses it."""
 
@@ -108,13 +111,21 @@ def prepared(step: MapStep) -> Tool:
     Raises:
         ValidationError: If an option is not one.
     """
-    module, _, name = TOOLS[step.tool].partition(":")
-    tool = getattr(import_module(module), name)
-    hint = get_type_hints(tool).get("config", OperatorConfig)
-    config_type = next(t for t in (hint, *getattr(hint, "__args__", ())) if _is_config(t))
-    config = config_type.model_validate(step.config)
-    return partial(tool, config=config) if hint is not OperatorConfig else tool
+    tool, config_type = loaded(step.tool)
+    if config_type is None:
+        OperatorConfig.model_validate(step.config)
+        return tool
+    return partial(tool, config=config_type.model_validate(step.config))
 
 
-def _is_config(found: object) -> bool:
+def loaded(name: str) -> tuple[Callable[..., tuple[Map, Any]], type[BaseModel] | None]:
+    """Return the tool of this name and the type of its options, if it has any."""
+    module, _, function = TOOLS[name].partition(":")
+    tool = getattr(import_module(module), function)
+    hint = get_type_hints(tool).get("config")
+    types = (hint, *getattr(hint, "__args__", ()))
+    return tool, next((found for found in types if _is_config(found)), None)
+
+
+def _is_config(found: object) -> TypeGuard[type[BaseModel]]:
     return isinstance(found, type) and issubclass(found, BaseModel)

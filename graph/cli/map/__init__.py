@@ -11,6 +11,7 @@ from mapstream.graph.cli.map.certainty import align, covariance, reject_outliers
 from mapstream.graph.cli.map.edit import anchor, edit
 from mapstream.graph.cli.map.files import export_, import_
 from mapstream.graph.cli.map.history import journal, redo, undo
+from mapstream.graph.cli.map.landmarks import add_verbs, optimize_visual
 from mapstream.graph.cli.map.look import check, stats, view
 from mapstream.graph.cli.map.loops import close_loops, fix_stationary, loops
 from mapstream.graph.cli.map.parts import merge, remove
@@ -36,6 +37,9 @@ app.command("redo")(redo)
 app.command("import")(import_)
 app.command("export")(export_)
 app.command("optimize")(optimize)
+app.command("optvi", hidden=True)(optimize)
+app.command("optimize-visual")(optimize_visual)
+app.command("optv", hidden=True)(optimize_visual)
 app.command("relax")(relax)
 app.command("reject-outliers")(reject_outliers)
 app.command("align")(align)
@@ -47,3 +51,4 @@ app.command("anchor")(anchor)
 app.add_typer(edit, name="edit")
 app.command("remove")(remove)
 app.command("merge")(merge)
+add_verbs(app)

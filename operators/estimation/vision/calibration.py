@@ -71,6 +71,8 @@ class CalibrationReport:
 
     def lines(self) -> Iterator[str]:
         """Return what to tell people, line by line."""
+        if not self.cameras:
+            yield "no camera has seen a landmark: make landmarks from tracks first"
         for found in self.cameras:
             yield f"{found.camera} of mission {found.mission[:8]}: keypoints {found.rms_before_px:.3f} -> {found.rms_after_px:.3f} px"
             if np.isfinite(found.sigma_m):
@@ -87,7 +89,7 @@ def calibrate(map_: Map, config: CalibrateConfig | None = None) -> tuple[Map, Ca
     """Return the map with the calibration of its cameras that explains it best, and what that changes.
 
     Raises:
-        EstimationError: If no camera takes part, or the data does not determine what is looked for.
+        EstimationError: If the data does not determine what is looked for.
     """
     config = config or CalibrateConfig()
     best, _ = optimize_map(map_, OptimizeConfig())
@@ -97,7 +99,7 @@ def calibrate(map_: Map, config: CalibrateConfig | None = None) -> tuple[Map, Ca
     after = make_problem(refined, options)
     cameras = [s for s in after.bundle.sensors if s.keys]
     if not cameras:
-        raise EstimationError("no camera has seen a landmark: make landmarks from tracks first")
+        return map_, CalibrationReport(cameras=())
     sigmas = _sigmas(after.bundle, after.whole_graph(), after.values)
     errors_px = rms_px(before.bundle, before.values), rms_px(after.bundle, after.values)
     found = []

@@ -11,7 +11,6 @@ from mapstream.operators.landmarks.create import create_landmarks
 from mapstream.operators.maps.sparsify import SparsifyConfig, sparsify
 from mapstream.recordings.maps.check import check_map
 from mapstream.recordings.maps.model import Map
-from mapstream.streams.errors import MapError
 from tests.operators.vision_worlds import World
 
 
@@ -79,7 +78,11 @@ def test_M8_large_maps_are_parted() -> None:
     assert (landmarks_by_vertex(left) >= needed - report.num_parts).all()
 
 
-def test_M8_a_map_without_landmarks_is_refused() -> None:
-    """It says what to do first."""
-    with pytest.raises(MapError, match="make landmarks from tracks first"):
-        sparsify(World(num_points=5).map())
+def test_M8_a_map_without_landmarks_stays() -> None:
+    """There is nothing to choose from."""
+    map_ = World(num_points=5).map()
+
+    left, report = sparsify(map_)
+
+    assert left is map_
+    assert report.num_kept == 0

@@ -73,8 +73,8 @@ def test_U18_what_the_motion_does_not_show_is_refused() -> None:
 
     with pytest.raises(EstimationError, match=r"its position stays uncertain by .* record turns"):
         calibrate(map_)
-    with pytest.raises(EstimationError, match="no camera has seen a landmark"):
-        calibrate(with_imu_and_cameras(world))
+    _, report = calibrate(with_imu_and_cameras(world))
+    assert "no camera has seen a landmark" in next(report.lines())
 
 
 def test_K11_F11_a_lens_is_found_and_stays_if_it_is_fixed() -> None:
