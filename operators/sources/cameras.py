@@ -65,10 +65,17 @@ class Cameras:
 
     def _beside(self, topic: str, frame: str) -> CameraCalibration | None:
         beside = [name for name in self._topics if _namespace(name) == _namespace(topic)]
-        if len(beside) == 1:
-            return self.first(beside[0])
         found = [self.first(name) for name in beside or self._topics]
-        return next((camera for camera in found if camera and camera.frame == frame), None)
+        is_meant = len(beside) == 1
+        chosen = [camera for camera in found if camera and (is_meant or camera.frame == frame)]
+        if not chosen:
+            return None
+        if "rect" in topic and chosen[0].distortion != "none":
+            self.notices[
+                f"{topic} seems to be rectified, but its calibration has a distortion ({chosen[0].distortion}):"
+                " if so, describe the camera in a sensor file"
+            ] += 1
+        return chosen[0]
 
     def _read(self, topic: str) -> CameraCalibration | None:
         decode = decoder_for(self._recording.topics[topic].channel, CameraCalibration)

@@ -135,6 +135,11 @@ class CdrCursor:
             ]
         )
 
+    @property
+    def is_at_end(self) -> bool:
+        """Return whether nothing follows."""
+        return self.position == len(self.data)
+
     def end(self) -> None:
         """Check that the message ends here.
 

@@ -106,11 +106,12 @@ def camera_info(cursor: CdrCursor) -> CameraCalibration:
     height, width, name = cursor.u32(), cursor.u32(), cursor.text()
     parameters, K = cursor.sequence("<f8"), cursor.array("<f8", 9)
     cursor.array("<f8", 9 + 12)  # rectification, projection
-    binning, region = cursor.array("<u4", 2), cursor.array("<u4", 4)
-    cursor.u8()
-    cursor.end()
-    if (binning > 1).any() or region[:2].any():
-        raise ValueError("binning and regions of interest are not supported")
+    if not cursor.is_at_end:  # some writers leave out what they do not have
+        binning, region = cursor.array("<u4", 2), cursor.array("<u4", 4)
+        cursor.u8()
+        cursor.end()
+        if (binning > 1).any() or region[:2].any():
+            raise ValueError("binning and regions of interest are not supported")
     return calibration_of(
         name, parameters, K, size_px=(width, height), stamp_ns=stamp_ns, frame=frame
     )

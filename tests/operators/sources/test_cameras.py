@@ -25,6 +25,7 @@ from mapstream.streams.messages.sensors import CameraFrame, EncodedImage
 from mapstream.streams.messages.vision import ImageFeatures
 from mapstream.streams.rig import Extrinsics, Rig
 from mapstream.streams.sensors import CameraSensor, FeatureSensor
+from tests.data import shared
 
 pytestmark = pytest.mark.anyio
 _GRAY = np.full((48, 64), 90, np.uint8)
@@ -98,6 +99,30 @@ async def test_a_topic_beside_the_images_describes_their_camera(tmp_path: Path) 
     topic = {"topic": "/left/image", "calibration": "/right/odd"}
     with pytest.raises(RecordingError, match="no topic /right/odd"):
         await _played(tmp_path / "drive.mcap", {"frames": topic})
+
+
+async def test_images_that_seem_rectified_with_a_calibration_of_the_lens_are_named(
+    tmp_path: Path,
+) -> None:
+    with McapWriter(tmp_path / "drive.mcap") as writer:
+        writer.write("/left/camera_info", _camera(1.0), 5)
+        writer.write("/left/image_rect", _frame())
+    run_context = Context()
+
+    await _played(tmp_path / "drive.mcap", {"frames": "/left/image_rect"}, run_context)
+
+    (warning,) = run_context.activity.warnings
+    assert "/left/image_rect seems to be rectified, but its calibration has a distortion" in warning
+
+
+async def test_the_calibration_of_a_real_car() -> None:
+    config = {"images": "/camera/image/compressed"}
+
+    out = await _played(
+        shared("kitti_camera_lidar") / "kitti_camera_lidar.mcap", config, end_s=0.05
+    )
+
+    assert _focal_px(out["images"][0]) == 721.5377
 
 
 async def test_a_sensor_file_comes_before_topics_and_the_message_itself_before_both(

@@ -2,6 +2,7 @@
 
 import contextlib
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -36,6 +37,7 @@ from tests.recordings.decoding.made_ros import (
 )
 
 both = pytest.mark.parametrize("encoding", ["cdr", "ros1"])
+_BINNING_AND_REGION = 2 * 4 + 4 * 4 + 1  # bytes at the end of a CameraInfo
 _AT_1_2_3 = [[0, -1, 0, 1], [1, 0, 0, 2], [0, 0, 1, 3], [0, 0, 0, 1]]
 
 
@@ -310,6 +312,16 @@ def test_camera_info(encoding: str) -> None:
     assert (camera.width_px, camera.height_px, camera.distortion) == (640, 480, "radtan")
     assert camera.distortion_parameters.tolist() == [0.1, 0.2, 0.3, 0.4, 0.5]
     assert camera.camera_matrix.tolist() == [[500, 0, 320], [0, 510, 240], [0, 0, 1]]
+
+
+def test_camera_info_that_ends_before_binning_has_none() -> None:
+    """As minimal writers have it, with a schema that says so."""
+    whole = _camera_info("cdr")
+    short = replace(whole, data=whole.data[:-_BINNING_AND_REGION])
+
+    assert _decode(short).focal_px.tolist() == [500, 510]
+    with pytest.raises(DecodeError, match="it ends inside a field of 8 bytes"):
+        _decode(replace(whole, data=whole.data[: -_BINNING_AND_REGION + 4]))
 
 
 def test_camera_info_that_says_too_little_or_too_much() -> None:
