@@ -25,7 +25,7 @@ from mapstream.streams.arrays import Float32Array, FloatArray, IntArray
 class LookConfig(IndexConfig):
     """When two descriptors look alike."""
 
-    max_bits: float = Field(default=0.2, gt=0.0, lt=1.0)
+    max_bits: float = Field(default=0.15, gt=0.0, lt=1.0)
     """The share of the bits in which two descriptors of one point may differ."""
     max_distance: PositiveFloat = 0.8
     """How far apart two descriptors that are numbers may be, as a share of their length."""

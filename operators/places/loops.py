@@ -186,4 +186,4 @@ def _merged(
 
 def _code(reason: str) -> str:
     """Return a reason without its figures, so that reasons can be counted."""
-    return re.sub(r"\b\d+ ", "", reason)
+    return re.sub(r"[\d.]+ ", "", reason)

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from pydantic import Field
+from pydantic import Field, PositiveFloat
 
 from mapstream.operators.operator import OperatorConfig
 from mapstream.operators.places.covisibility import CovisibilityConfig, Place, places
@@ -32,6 +32,10 @@ class RecognitionConfig(OperatorConfig):
     look: LookConfig = Field(default_factory=LookConfig)
     covisibility: CovisibilityConfig = Field(default_factory=CovisibilityConfig)
     consensus: ConsensusConfig = Field(default_factory=ConsensusConfig)
+    min_inlier_share: float = Field(default=0.25, ge=0.0, le=1.0)
+    """Of the keypoints that match a place, those that must agree; textures that repeat match without agreeing."""
+    max_sigma_m: PositiveFloat = 0.3
+    """How uncertain the position may be, along any axis."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -52,7 +56,7 @@ class Found:
 
     vertex: int  # that sees most of what the frame sees
     consensus: Consensus
-    inliers: Matches  # one for each keypoint
+    inliers: Matches  # no keypoint of a view comes twice, and no landmark
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -160,15 +164,32 @@ def _verified(  # all that is known
         raise EstimationError(f"{num} matches of one place, fewer than {least}")
     sightings = sightings_of(views, place.matches, landmarks_map)
     consensus = find_pose(sightings, config.consensus, seed)
-    inliers = place.matches.take(consensus.is_inlier)
-    keypoints = np.stack([inliers.view, inliers.feature])
-    inliers = inliers.take(np.sort(np.unique(keypoints, axis=1, return_index=True)[1]))
-    if len(inliers) < config.consensus.min_inliers:
-        least = config.consensus.min_inliers
-        raise EstimationError(f"{len(inliers)} keypoints agree, fewer than {least}")
+    inliers = _one_to_one(place.matches.take(consensus.is_inlier))
+    least, share = config.consensus.min_inliers, len(inliers) / _num_keypoints(place.matches)
+    num_landmarks = len(np.unique(inliers.landmark))
+    if num_landmarks < least:
+        raise EstimationError(f"inliers of {num_landmarks} landmarks, fewer than {least}")
+    if share < config.min_inlier_share:
+        raise EstimationError(f"{share:.2f} of the keypoints agree, < {config.min_inlier_share:g}")
+    sigma_m = float(np.sqrt(np.linalg.eigvalsh(consensus.pose.covariance[3:, 3:])[-1]))
+    if sigma_m > config.max_sigma_m:
+        raise EstimationError(f"the position is uncertain by {sigma_m:.2f} m")
     common = [
         int(np.isin(database.landmarks_of(vertex), inliers.landmark).sum())
         for vertex in place.vertices.tolist()
     ]
     nearest = int(place.vertices[int(np.argmax(common))])
     return Found(vertex=nearest, consensus=consensus, inliers=inliers)
+
+
+def _one_to_one(matches: Matches) -> Matches:
+    """Return matches in which no keypoint and no landmark comes twice; those that look most alike stay."""
+    matches = matches.take(np.argsort(matches.distance, kind="stable"))
+    keypoints = np.stack([matches.view, matches.feature])
+    matches = matches.take(np.sort(np.unique(keypoints, axis=1, return_index=True)[1]))
+    seen_by = np.stack([matches.view, matches.landmark])  # cameras that overlap see a landmark each
+    return matches.take(np.sort(np.unique(seen_by, axis=1, return_index=True)[1]))
+
+
+def _num_keypoints(matches: Matches) -> int:
+    return int(np.unique(np.stack([matches.view, matches.feature]), axis=1).shape[1])

@@ -127,7 +127,7 @@ def _costs(sightings: Sightings, poses: FloatArray, config: ConsensusConfig) -> 
     costs = np.full(len(poses), most * len(sightings))
     T_base_map = invert(poses)
     for camera, rows in _groups(sightings):
-        points = np.einsum("mij,nj->mni", T_base_map[:, :3, :3], sightings.points_map[rows])
+        points = sightings.points_map[rows] @ np.swapaxes(T_base_map[:, :3, :3], 1, 2)
         points += T_base_map[:, None, :3, 3]
         if camera is None:
             sigmas = np.fmax(sightings.sigmas_m[rows], config.sigma_m)

@@ -58,7 +58,7 @@ class IndexConfig(OperatorConfig):
     """Numbers to which the multi-index projects bits; even."""
     words: PositiveInt = 24
     """Cells that the multi-index looks into: more find more and take longer."""
-    exact_up_to: NonNegativeInt = 20_000
+    exact_up_to: NonNegativeInt = 5_000
     """Descriptors below which the multi-index compares all of them."""
     trees: PositiveInt = 4
     """Of FLANN."""
