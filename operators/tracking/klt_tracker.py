@@ -53,6 +53,7 @@ class KltTracker:
         self._config = config
         self._finds_corners = finds_corners
         self._numbers: TrackNumbers | None = None
+        self._kind = "klt"
         self._image: GrayImage | None = None  # the newest one
         self._live: LiveTracks | None = None
 
@@ -70,6 +71,8 @@ class KltTracker:
             detections: Keypoints of this image, some of which become tracks.
         """
         image = gray(frame)
+        if detections is not None and (self._live is None or len(self._live.features) == 0):
+            self._kind = detections.kind
         live = self._followed(frame, image, turn)
         if self._finds_corners and len(live.features) < self._config.max_tracks:
             detections = self._corners(frame, image)
@@ -119,7 +122,7 @@ class KltTracker:
     ) -> LiveTracks:
         """Return the tracks of the image before that are found in this one."""
         config, before, live = self._config, self._image, self._live
-        none = features_in(frame, "klt" if live is None else live.features.kind, _NO_PX)
+        none = features_in(frame, self._kind, _NO_PX)
         if live is None or before is None:
             return LiveTracks.new(none)
         if before.shape != image.shape:
@@ -139,7 +142,7 @@ class KltTracker:
         px, scores = corners(image, config.min_corner_quality, config.min_distance_px)
         if len(px) == 0:
             warn(f"images of {frame.frame} without a corner: too dark, or without texture")
-        return features_in(frame, "klt", px, scores=scores)
+        return features_in(frame, self._kind, px, scores=scores)
 
     def _joined(self, live: LiveTracks, detections: ImageFeatures, image: GrayImage) -> LiveTracks:
         """Return the tracks and new ones."""
