@@ -1,5 +1,7 @@
 """Maps that were made apart, as one: what several of them hold, by its id, is there once.
 
+A mission may be in several maps as a whole, or in parts that share a vertex, such as submaps.
+
 Source: Cramariuc et al., maplab 2.0, RA-L 2023, section III-D (merging of missions and submaps).
 """
 
@@ -10,6 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from mapstream.operators.maps.joining import NoCommonVertexError, following
 from mapstream.operators.operator import OperatorConfig
 from mapstream.recordings.maps.columns import BoolArray, IdArray, references_of
 from mapstream.recordings.maps.combine import select_missions
@@ -44,54 +47,84 @@ class MergeReport:
     num_missions: int
     num_vertices: int
     repeated: tuple[str, ...]  # ids of missions that several maps held
+    joined: tuple[str, ...] = ()  # those of them of which the maps held different parts
 
 
 def merge(maps: Sequence[Map], config: MergeConfig | None = None) -> tuple[Map, MergeReport]:
     """Return one map with the missions of all; the first map's frame is the map frame.
 
     A mission that is in several maps with the same content is there once, and places the others of its map.
+    Parts of a mission follow on each other, in any order of the maps; where both are, the earlier map's states count.
     Missions of maps without a known place keep it as a guess, until something anchors them.
 
     Raises:
-        MapError: If two maps hold one mission with different content, or one outer frame with two origins.
+        MapError: If two maps hold one mission with different content where both are, or parts of one that share no
+            vertex, or one outer frame with two origins.
     """
     config = config or MergeConfig()
-    merged, repeated = Map.empty(), list[str]()
-    for number, map_ in enumerate(maps):
-        common = _common_missions(merged, map_)
-        _require_same_frames(merged.frames, map_.frames)
-        added = map_ if number == 0 or config.has_common_frame else _placed(map_, merged, common)
-        num_rows = {name: len(table) for name, table in merged.tables().items()}
-        pairs = zip(TABLES, merged.tables().values(), added.tables().values(), strict=True)
-        both = {name: concatenate([old, shifted(new, num_rows)]) for name, old, new in pairs}
-        merged = _with_each_row_once(from_tables(both))
+    merged, repeated, joined = Map.empty(), list[str](), list[str]()
+    waiting, passed_over = list(maps), 0
+    while waiting:
+        map_ = waiting.pop(0)
+        try:
+            placed, common, parts = _fitted(map_, merged, config)
+        except NoCommonVertexError:
+            passed_over += 1
+            if passed_over > len(waiting):
+                raise
+            waiting.append(map_)
+            continue
+        passed_over = 0
+        merged = _with_each_row_once(_stacked(merged, placed))
         repeated += common
+        joined += parts
+    if joined:
+        merged = in_canonical_order(merged)  # parts may have come in any order
     return merged, MergeReport(
         num_missions=len(merged.missions),
         num_vertices=len(merged.vertices),
         repeated=tuple(repeated),
+        joined=tuple(joined),
     )
 
 
-def _common_missions(a: Map, b: Map) -> list[str]:
-    """Return the ids of missions of both maps.
+def _fitted(map_: Map, merged: Map, config: MergeConfig) -> tuple[Map, list[str], list[str]]:
+    """Return a map as it lies beside another one, the missions that both hold, and those with different parts."""
+    keys = np.intersect1d(as_keys(merged.missions.id), as_keys(map_.missions.id))
+    common = [key.tobytes().hex() for key in keys]
+    parts = [mission_id for mission_id in common if _is_part(merged, map_, mission_id)]
+    for mission_id in parts:
+        map_ = following(map_, merged, mission_id)
+    _require_same_frames(merged.frames, map_.frames)
+    if len(merged.missions) and not config.has_common_frame:
+        map_ = _placed(map_, merged, common)
+    return map_, common, parts
+
+
+def _stacked(a: Map, b: Map) -> Map:
+    """Return the rows of both maps."""
+    num_rows = {name: len(table) for name, table in a.tables().items()}
+    pairs = zip(TABLES, a.tables().values(), b.tables().values(), strict=True)
+    return from_tables({n: concatenate([old, shifted(new, num_rows)]) for n, old, new in pairs})
+
+
+def _is_part(a: Map, b: Map, mission_id: str) -> bool:
+    """Return whether two maps hold different parts of a mission; else they hold the same.
 
     Raises:
-        MapError: If one differs.
+        MapError: If they have the same vertices, and something else differs.
     """
-    keys = np.intersect1d(as_keys(a.missions.id), as_keys(b.missions.id))
-    common = [key.tobytes().hex() for key in keys]
-    for mission_id in common:
-        contents = zip(
-            _content(a, mission_id).items(), _content(b, mission_id).values(), strict=True
+    stamps_ns = [m.vertices.stamp_ns[m.vertices_of(m.mission_row(mission_id))] for m in (a, b)]
+    if not np.array_equal(stamps_ns[0], stamps_ns[1]):
+        return True
+    contents = zip(_content(a, mission_id).items(), _content(b, mission_id).values(), strict=True)
+    differing = [name for (name, left), right in contents if left != right]
+    if differing:
+        raise MapError(
+            f"mission {mission_id} is in two maps, and its {', '.join(differing)} differ;"
+            " remove it from one of them before merging"
         )
-        differing = [name for (name, left), right in contents if left != right]
-        if differing:
-            raise MapError(
-                f"mission {mission_id} is in two maps, and its {', '.join(differing)} differ;"
-                " remove it from one of them before merging"
-            )
-    return common
+    return False
 
 
 def _content(map_: Map, mission_id: str) -> dict[str, bytes]:

@@ -61,7 +61,7 @@ def merge(
     ] = False,
     json: JsonFlag = False,
 ) -> None:
-    """Take the missions of other maps into this one; a mission that both have must be the same."""
+    """Take the missions of other maps into this one; parts of a mission that both have join."""
     folder: Path = context.obj
     config = MergeConfig(has_common_frame=common_frame)
     added = [require_valid(load_map(other), other) for other in others]
@@ -85,7 +85,8 @@ def merge(
     counts = f"{report.num_missions} missions, {report.num_vertices} vertices"
     say(f"{in_place(folder)}: {counts}")
     for mission_id in report.repeated:
-        say(f"mission {mission_id} was in several maps, and is in this one once")
+        how = "joined from its parts" if mission_id in report.joined else "in this one once"
+        say(f"mission {mission_id} was in several maps, and is {how}")
 
 
 def _copy_files(map_: Map, source: Path, target: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from mapstream.recordings.maps import Map, check_map
 from mapstream.recordings.maps.build import add_edges, anchored, append_edges, with_poses
 from mapstream.recordings.maps.combine import select_missions
 from mapstream.recordings.maps.ids import derived_id, id_array
+from mapstream.recordings.maps.order import in_canonical_order
 from mapstream.recordings.maps.tables import Edges, Frames
 from mapstream.streams.errors import MapError
 from mapstream.streams.geometry import SE3
@@ -128,3 +130,91 @@ def test_M4_one_outer_frame_with_two_origins_is_refused() -> None:
 
     with pytest.raises(MapError, match=r"outer frame 'enu' has origin \[47\.3.*in another"):
         merge([a, b])
+
+
+def part(map_: Map, first: int, last: int, T_part: SE3 | None = None) -> Map:
+    """What a map holds between two of its vertices, in a mission frame of its own."""
+    at = np.arange(len(map_.vertices))
+    cut = map_.select(vertices=(at >= first) & (at <= last))
+    T = (T_part or SE3.identity()).matrix
+    vertices = cut.vertices
+    turned = (T[:3, :3] @ vertices.velocity_mps[:, :, None])[:, :, 0]
+    moved = replace(vertices, T_mission_base=T @ vertices.T_mission_base, velocity_mps=turned)
+    return replace(cut, vertices=moved)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_M5_parts_of_a_mission_join_to_the_uncut_one_in_any_order(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    whole = line_map(20)
+    cuts = [0, *np.sort(rng.choice(np.arange(1, 19), 3, replace=False)).tolist(), 19]
+    T_parts = [SE3.exp(rng.normal(size=6)) for _ in cuts[1:]]
+    parts = [
+        part(whole, first, last, T)
+        for (first, last), T in zip(pairwise(cuts), T_parts, strict=True)
+    ]
+    order = rng.permutation(len(parts)).tolist()
+
+    together, report = merge([parts[at] for at in order])
+
+    assert report.joined == (MISSION,) * 3
+    assert check_map(together) == []
+    T_first = T_parts[order[0]].matrix
+    expected = T_first @ whole.vertices.T_mission_base
+    np.testing.assert_allclose(together.vertices.T_mission_base, expected, atol=1e-9)
+    velocity = (T_first[:3, :3] @ whole.vertices.velocity_mps[:, :, None])[:, :, 0]
+    np.testing.assert_allclose(together.vertices.velocity_mps, velocity, atol=1e-9)
+    at_rest = replace(
+        together,
+        vertices=replace(
+            together.vertices,
+            T_mission_base=whole.vertices.T_mission_base,
+            velocity_mps=whole.vertices.velocity_mps,
+        ),
+    )
+    assert at_rest.digest() == in_canonical_order(whole).digest()
+
+
+def test_M5_a_longer_map_of_the_same_mission_adds_what_is_new() -> None:
+    whole = full_map()
+    start = part(whole, 0, 3)
+
+    longer, _ = merge([start, whole])
+    shorter, report = merge([whole, start])
+
+    assert report.joined == (MISSION,)
+    assert shorter.digest() == in_canonical_order(whole).digest()
+    assert longer.edges.id.tobytes() == shorter.edges.id.tobytes()
+    assert len(longer.imu) == len(whole.imu)
+    assert check_map(longer) == []
+
+
+def test_M5_a_part_places_the_other_missions_of_its_map() -> None:
+    whole, T = line_map(8), SE3.exp([0.1, 0.0, 0.5, 3.0, 2.0, 1.0])
+    other = anchored(
+        merge([part(whole, 4, 7, T), line_map(3, OTHER_MISSION)])[0], 1, SE3.identity()
+    )
+
+    together, _ = merge([part(whole, 0, 4), other])
+
+    row = together.mission_row(OTHER_MISSION)
+    expected = T.inverse()  # where the part's frame lies in the whole one's
+    np.testing.assert_allclose(
+        together.missions.T_map_mission_of(row).matrix, expected.matrix, atol=1e-9
+    )
+
+
+def test_M5_parts_that_do_not_touch_or_differ_are_refused() -> None:
+    whole = line_map(9)
+    covariance = whole.edges.covariance.copy()
+    covariance[2] *= 2
+    other = replace(whole, edges=replace(whole.edges, covariance=covariance))
+    at = np.arange(9)
+    sparse = whole.select(vertices=(at != 3) & (at < 6))
+
+    with pytest.raises(MapError, match=rf"mission {MISSION} is in two maps that share no vertex"):
+        merge([part(whole, 0, 3), part(whole, 5, 8)])
+    with pytest.raises(MapError, match="its edges differ where both are"):
+        merge([part(whole, 0, 5), other])
+    with pytest.raises(MapError, match="their vertices differ"):
+        merge([sparse, whole])
