@@ -24,7 +24,7 @@ class Eliminated:
     H: FloatArray  # (F, M, C) in units of sigma, without what a shift of the point explains
     residuals: FloatArray  # (F, M) measured less expected, the same
     point_by_poses: FloatArray  # (F, 3, C)
-    point_covariance: FloatArray  # (F, 3, 3) were the poses exact
+    point_roots: FloatArray  # (F, 3, 3) roots of the points' covariances, were the poses exact
     point_shift: FloatArray  # (F, 3) from where they were triangulated to where they fit best
 
     def information(self) -> tuple[FloatArray, FloatArray]:
@@ -55,6 +55,6 @@ def eliminate(group: Grouped, num_poses: int) -> Eliminated:
         H + of_point @ follow,
         r - (of_point @ shift[..., None])[..., 0],
         axes @ follow,
-        axes @ C @ np.swapaxes(axes, 1, 2),
+        axes @ np.linalg.cholesky((C + np.swapaxes(C, 1, 2)) / 2),
         (axes @ shift[..., None])[..., 0],
     )

@@ -80,6 +80,20 @@ class Sightings:
     def __len__(self) -> int:
         return len(self.keys)
 
+    def without_far_pairs(self, most_baselines: float) -> Sightings:
+        """Return the sightings of one image, of points beyond so many baselines only the first camera's.
+
+        A pair's calibration errs by some tenth of a pixel, always to the same side. Near points hardly notice;
+        of far ones many images would average to a distance that is certain and wrong.
+        """
+        order = np.argsort(self.keys, kind="stable")
+        again = np.append(False, self.keys[order][1:] == self.keys[order][:-1])
+        second, first = order[again], order[np.flatnonzero(again) - 1]
+        parallax = np.linalg.norm(self.rays[second] - self.rays[first], axis=1)
+        kept = np.ones(len(self), bool)
+        kept[second[parallax * most_baselines < 1]] = False
+        return self.chosen(kept)
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Grouped:

@@ -82,7 +82,8 @@ def begin_points(
         position = (
             found.found.points.positions[k] + found.found.point_shift[k] + follow @ correction
         )
-        state.add_point(int(found.keys[k]), position, by_state, found.found.point_covariance[k])
+        root = found.found.point_roots[k]
+        state.add_point(int(found.keys[k]), position, by_state, root @ root.T)
 
 
 def is_certain(found: Constraints) -> BoolArray:
