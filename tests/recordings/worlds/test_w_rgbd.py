@@ -46,7 +46,7 @@ def poses(messages: list[Any]) -> dict[int, np.ndarray]:
     return {m.stamp_ns: (m.T_odom_base @ T_BASE_CAMERA).matrix for m in truth}
 
 
-def test_the_same_seed_gives_the_same_bytes(tmp_path: Path) -> None:
+def test_R9_the_same_seed_gives_the_same_bytes(tmp_path: Path) -> None:
     paths = [tmp_path / name for name in ("a.mcap", "b.mcap", "c.mcap")]
     for path, seed in zip(paths, (3, 3, 4), strict=True):
         simulate("w_rgbd", path, seed=seed, **SMALL | {"duration_s": 4.0})

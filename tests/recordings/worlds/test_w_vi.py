@@ -55,7 +55,7 @@ def grey(image: EncodedImage) -> np.ndarray:
     return np.asarray(cv2.imdecode(image.data, cv2.IMREAD_GRAYSCALE))
 
 
-def test_the_same_seed_gives_the_same_bytes(tmp_path: Path) -> None:
+def test_R9_the_same_seed_gives_the_same_bytes(tmp_path: Path) -> None:
     """Images are drawn by several threads, and yet come out the same."""
     paths = [tmp_path / name for name in ("a.mcap", "b.mcap", "c.mcap")]
     for path, seed in zip(paths, (3, 3, 4), strict=True):
