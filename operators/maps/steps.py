@@ -34,6 +34,7 @@ TOOLS = {
     "remove_invalid_observations": "mapstream.operators.landmarks.removal:remove_invalid_observations",
     "reset_quality": "mapstream.operators.landmarks.quality:reset_quality",
     "retriangulate": "mapstream.operators.landmarks.create:retriangulate",
+    "summarize": "mapstream.operators.places.summary:summarize",
     "sparsify": "mapstream.operators.maps.sparsify:sparsify",
 }
 """By the name that graph files use; what is imported is imported when a graph uses it."""

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from pydantic import Field, PositiveFloat, PositiveInt
 
+from mapstream.operators.maps.missions import find_mission
 from mapstream.operators.places.database import PlaceDatabase
 from mapstream.operators.places.recognition import RecognitionConfig, recognize, seed_of
 from mapstream.operators.places.searching import landmark_positions
@@ -39,6 +40,8 @@ class AnchoringConfig(RecognitionConfig):
     """Rounds over all missions; one that is anchored may carry others."""
     every: PositiveInt = 1
     """One vertex in so many is compared."""
+    mission: str | None = None
+    """First digits of an id, or a name: only this mission; null: all whose place is not known."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -58,6 +61,14 @@ class AnchoringReport:
 
     missions: list[AnchoredMission]
 
+    def lines(self) -> list[str]:
+        """Return what to tell people."""
+        return [
+            f"mission {m.mission_id[:8]}: {m.verdict} ({m.num_recognised} of {m.num_compared} frames"
+            f" recognised, {m.num_agreeing} agree)"
+            for m in self.missions
+        ] or ["every mission is anchored already"]
+
     @property
     def num_anchored(self) -> int:
         return sum(each.verdict == _ANCHORED for each in self.missions)
@@ -67,26 +78,26 @@ _ANCHORED = "anchored"
 
 
 def anchor_missions(
-    map_: Map, config: AnchoringConfig | None = None, mission_row: int | None = None
+    map_: Map, config: AnchoringConfig | None = None
 ) -> tuple[Map, AnchoringReport]:
     """Return the map with missions anchored to those that are known already; others stay unknown.
 
     Args:
         map_: The map; at least one mission is known.
         config: When frames agree.
-        mission_row: Only this mission; all that are unknown without.
+
+    Raises:
+        MapError: If there is no such mission as the config names.
     """
     config = config or AnchoringConfig()
+    chosen = range(len(map_.missions))
+    if config.mission is not None:
+        chosen = range(row := find_mission(map_, config.mission), row + 1)
     reports: dict[int, AnchoredMission] = {}
     for _ in range(config.trials):
         is_known = map_.missions.is_base_frame_known
-        unknown = [
-            row
-            for row in np.flatnonzero(~is_known).tolist()
-            if mission_row is None or row == mission_row
-        ]
         before = map_
-        for row in unknown:
+        for row in (row for row in chosen if not is_known[row]):
             map_, reports[row] = _anchor(map_, row, config)
         if map_ is before:
             break

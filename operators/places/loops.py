@@ -84,6 +84,15 @@ class VisualLoopsReport:
     candidates: list[ComparedPlace]
     roc: list[RocPoint]  # of the score, by the verdict of the geometry
 
+    def lines(self) -> list[str]:
+        """Return what to tell people."""
+        by_kind = ", ".join(f"{num} of {kind}" for kind, num in self.inliers_by_kind.items())
+        return [
+            f"{self.num_accepted} of {self.num_compared} vertices recognised; inliers: {by_kind or 'none'}",
+            f"{self.num_edges} edges added, {self.num_merged} landmarks merged",
+            *(f"not recognised: {num}: {reason}" for reason, num in self.reasons.items()),
+        ]
+
 
 def find_visual_loops(
     map_: Map, config: VisualLoopsConfig | None = None

@@ -15,6 +15,7 @@ from mapstream.graph.cli.map.landmarks import add_verbs, optimize_visual
 from mapstream.graph.cli.map.look import check, stats, view
 from mapstream.graph.cli.map.loops import close_loops, fix_stationary, loops
 from mapstream.graph.cli.map.parts import merge, remove
+from mapstream.graph.cli.map.places import summarize
 from mapstream.graph.cli.map.solve import optimize, relax
 
 app = typer.Typer(
@@ -51,4 +52,6 @@ app.command("anchor")(anchor)
 app.add_typer(edit, name="edit")
 app.command("remove")(remove)
 app.command("merge")(merge)
+app.command("summarize")(summarize)
+app.command("clsm", hidden=True)(summarize)
 add_verbs(app)
