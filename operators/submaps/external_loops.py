@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from bisect import bisect_left
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import ClassVar
 
 import numpy as np
@@ -31,7 +32,7 @@ class ExternalLoopsConfig(OperatorConfig):
     min_quality: float = 0.0
     """Loops of a lower quality are rejected."""
     robots: dict[str, str] = Field(default_factory=dict)
-    """By the names that loops use: the first digits of a mission's id; none where there is one mission alone."""
+    """By the names that loops use: the first digits of a mission's id; none where there is one robot alone."""
 
 
 @dataclass(frozen=True)
@@ -112,21 +113,31 @@ class ExternalLoops(Operator[Inputs, Outputs]):
             missions = self._missions(robot)
             if not missions:
                 return f"no mission of robot {robot!r} came; there are {sorted(self._tracks)}"
-            track = self._tracks[missions[0]]
-            if len(missions) == 1 and stamp_ns > track.last_ns:
-                return f"mission {missions[0]} ends before {stamp_ns} ns"
+            if stamp_ns > max(self._tracks[mission].last_ns for mission in missions):
+                return f"mission {missions[-1]} ends before {stamp_ns} ns"
         return ""
 
     def _missions(self, robot: str) -> list[str]:
-        """Return the missions that a robot's name may mean."""
+        """Return the missions that a robot's name may mean, in the order of time."""
         digits = self._config.robots.get(robot, robot)
-        return [mission for mission in self._tracks if mission.startswith(digits)]
+        found = [mission for mission in self._tracks if mission.startswith(digits)]
+        return sorted(found, key=lambda mission: self._tracks[mission].first_ns)
 
     def _end(self, robot: str, stamp_ns: int) -> End:
+        """Return an end of a loop, in the one mission of the robot that was at that time.
+
+        Raises:
+            MapError: If there is none, or there are several.
+        """
         missions = self._missions(robot)
-        if len(missions) > 1:
-            raise MapError(f"several missions are called {robot!r}: {missions}")
-        return end_at(missions[0], self._tracks[missions[0]].trajectory(), stamp_ns)
+        spans = [(self._tracks[m].first_ns, self._tracks[m].last_ns) for m in missions]
+        if any(first[1] >= second[0] for first, second in pairwise(spans)):
+            raise MapError(f"several missions are called {robot!r} at the same time: {missions}")
+        at = [m for m, (a, b) in zip(missions, spans, strict=True) if a <= stamp_ns <= b]
+        if len(missions) > 1 and not at:
+            raise MapError(f"{stamp_ns} ns lies in none of the missions of {robot!r}: {missions}")
+        mission = at[0] if at else missions[0]
+        return end_at(mission, self._tracks[mission].trajectory(), stamp_ns)
 
 
 class _Track:
@@ -136,6 +147,10 @@ class _Track:
         self._stamps_ns: list[int] = []
         self._poses: list[np.ndarray[tuple[int, int], np.dtype[np.float64]]] = []
         self._trajectory: Trajectory | None = None
+
+    @property
+    def first_ns(self) -> int:
+        return self._stamps_ns[0]
 
     @property
     def last_ns(self) -> int:

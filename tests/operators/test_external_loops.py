@@ -164,6 +164,37 @@ async def test_robots_are_named_by_digits_or_by_the_config() -> None:
     assert [len(report.edges) for report in one] == [1]
 
 
+async def test_A15_C15_a_robot_whose_odometry_was_split_has_a_mission_for_each_stretch() -> None:
+    """The stamp says which; between two missions there is none."""
+    any_name = ExternalLoopsConfig(robots={"husky": ""})
+    drive = [submap(ONE, 0, 0, 2), submap(ONE, 1, 2, 4), submap(TWO, 0, 6, 8), submap(TWO, 1, 8, 9)]
+    names = {"robot_a": "husky", "robot_b": "husky"}
+    across = loop(ONE, SECOND, TWO, 7 * SECOND, **names)
+    inside = loop(TWO, 6 * SECOND, TWO, 9 * SECOND, **names)
+    between = loop(ONE, SECOND, ONE, 5 * SECOND, **names)
+
+    reports, _ = await reports_of([between, across, inside], drive, any_name)
+
+    assert [[(e.mission_a, e.mission_b) for e in report.edges] for report in reports] == [
+        [],
+        [],
+        [(ONE, TWO)],
+        [(TWO, TWO)],
+    ]
+    (rejected,) = [c.verdict for r in reports for c in r.candidates if c.verdict != "accepted"]
+    assert rejected == f"{5 * SECOND} ns lies in none of the missions of 'husky': {[ONE, TWO]}"
+
+
+async def test_A15_missions_of_one_name_at_the_same_time_are_refused() -> None:
+    made = loop(ONE, SECOND, TWO, 4 * SECOND, robot_a="husky", robot_b="husky")
+    drive = [submap(ONE, 0, 0, 3), submap(TWO, 0, 2, 4)]
+
+    reports, _ = await reports_of([made], drive, ExternalLoopsConfig(robots={"husky": ""}))
+
+    (verdict,) = [c.verdict for report in reports for c in report.candidates]
+    assert verdict.startswith("several missions are called 'husky' at the same time")
+
+
 async def test_what_another_search_found_stays() -> None:
     submaps = [submap(ONE, 0, 0, 2)]
     edges = (await reports_of([loop(ONE, 0, ONE, 2 * SECOND)], submaps))[0][0].edges
@@ -189,6 +220,44 @@ operators:
   optimizer: {use: optimizer, in: {submaps: submaps.submaps, loops: loops.loops}, run: inline}
   store: {use: map_store, in: {maps: optimizer.maps}, config: {path: $map}, run: inline}
 """
+
+
+SPLIT = GRAPH.replace(
+    "in: {odometry: sensors.odometry}",
+    "in: {odometry: guard.odometry}",
+).replace(
+    "  keyframes:",
+    "  guard: {use: odometry_guard, in: {odometry: sensors.odometry}, config: {on_jump: split}}\n"
+    "  keyframes:",
+)
+
+
+async def test_A15_C15_a_recorded_loop_joins_what_a_jump_has_split(tmp_path: Path) -> None:
+    """The odometry begins again, 80 m away; a loop says where the robot really was."""
+    with McapWriter(tmp_path / "drive.mcap") as writer:
+        for i in range(20):
+            way_m = 0.5 * i if i < 10 else 0.5 * i + 80
+            pose = SE3.from_rotation(np.eye(3), [way_m, 0, 0])
+            writer.write("/odometry", Odometry(stamp_ns=SECOND * (i + 1), T_odom_base=pose))
+        beside = LoopClosure(
+            robot_a="husky",
+            stamp_a_ns=SECOND * 5,
+            robot_b="husky",
+            stamp_b_ns=SECOND * 15,
+            T_a_b=SE3.from_rotation(np.eye(3), [5.0, 0, 0]),
+            covariance=np.eye(6) * 1e-6,
+        )
+        writer.write("/loops", beside, log_ns=SECOND * 20 + 1)
+    values = {"recording": str(tmp_path / "drive.mcap"), "map": str(tmp_path / "map")}
+
+    report = await run_graph(plan(parse_graph(SPLIT, params=values)))
+
+    assert report.status == "complete", report.reasons
+    map_ = load_map(tmp_path / "map")
+    assert (len(map_.missions), len(map_.edges_of("loop"))) == (2, 1)
+    seconds = map_.vertices.stamp_ns / SECOND
+    places = map_.T_map_base(np.arange(len(seconds)))[:, :3, 3]
+    np.testing.assert_allclose(places[:, 0], 0.5 * (seconds - 1), atol=0.01)
 
 
 async def test_A15_a_recorded_loop_closes_a_drive_in_a_graph(tmp_path: Path) -> None:

@@ -9,6 +9,7 @@ import pytest
 
 from mapstream.operators.estimation.batch import OptimizeConfig, optimize_map
 from mapstream.operators.estimation.covariance import covariances
+from mapstream.operators.estimation.factors.planes import coefficients
 from mapstream.operators.estimation.optimize_config import Loss
 from mapstream.recordings.maps.model import Map
 from mapstream.streams.arrays import FloatArray
@@ -20,6 +21,7 @@ from tests.operators.estimation.problems import (
     position_errors_m,
     wander,
     with_edge,
+    with_landmark,
     with_mission,
     with_relative,
 )
@@ -186,6 +188,34 @@ def test_K15_one_fix_leaves_the_heading_open() -> None:
     _, report = optimize_map(map_, OptimizeConfig(underconstrained="prior"))
 
     assert len(report.underconstrained) == NUM
+
+
+@pytest.mark.parametrize(
+    "open_variance", [(np.inf, np.inf, 1e-4), (1e-4, 1e-4, np.inf), (1e-4, np.inf, 1e-4)]
+)
+def test_K15_a_plane_that_is_open_in_a_direction_is_named_and_stays_there(
+    open_variance: tuple[float, float, float],
+) -> None:
+    """Tilts about x and y, and the shift along the normal: what no edge measures keeps its guess."""
+    map_, _ = ring()
+    place = se3_exp([0.0, 0.0, 0.0, 2.0, 1.0, -1.0])
+    map_ = with_landmark(map_, "plane", place)
+    tilt_x, tilt_y, shift = open_variance
+    covariance = np.diag([tilt_x, tilt_y, np.inf, np.inf, np.inf, shift])
+    seen = invert(map_.T_map_base(np.array([0])))[0] @ place
+    map_ = with_edge(map_, "plane", vertex_a=0, landmark_a=0, T_a_b=seen, covariance=covariance)
+
+    with pytest.raises(EstimationError, match=r"the landmark in row 0: not determined"):
+        optimize_map(map_)
+    result, report = optimize_map(map_, OptimizeConfig(underconstrained="prior"))
+
+    assert report.underconstrained == ["the landmark in row 0"]
+    alone, _ = optimize_map(map_.select(edges=map_.edges.kind != "plane"))
+    np.testing.assert_allclose(
+        result.vertices.T_mission_base, alone.vertices.T_mission_base, atol=1e-6
+    )
+    found = coefficients(result.T_map_landmark(np.array([0])))
+    np.testing.assert_allclose(found, coefficients(place[None]), atol=1e-3)
 
 
 def test_F15_a_mission_without_a_base_frame_moves_no_other() -> None:
