@@ -34,6 +34,7 @@ BUILT_IN = {
     "features": "mapstream.operators.features.features:Features",
     "fiducials": "mapstream.operators.images.fiducials:Fiducials",
     "gicp_odometry": "mapstream.operators.odometry.gicp_odometry:GicpOdometry",
+    "global_descriptors": "mapstream.operators.networks.global_descriptors:GlobalDescriptors",
     "gnss": "mapstream.operators.gnss.positions:Gnss",
     "gray": "mapstream.operators.images.gray:Gray",
     "image_decode": "mapstream.operators.decode.image:ImageDecode",
@@ -65,6 +66,7 @@ BUILT_IN = {
     "undistort": "mapstream.operators.images.undistort:Undistort",
     "visual_inertial_odometry": "mapstream.operators.odometry.visual_inertial.visual_inertial_odometry:VisualInertialOdometry",
     "visual_odometry": "mapstream.operators.odometry.visual.visual_odometry:VisualOdometry",
+    "visual_loops": "mapstream.operators.places.visual_loops:VisualLoops",
     "xfeat": "mapstream.operators.networks.xfeat:XFeat",
 }
 
