@@ -9,11 +9,12 @@ import cv2
 import numpy as np
 
 from mapstream.recordings.worlds.paint import Painter, Picture
-from mapstream.recordings.worlds.surfaces import Surface, box_outline, prism, rectangle
+from mapstream.recordings.worlds.surfaces import Surface, box_outline, prism, rectangle, shell
 from mapstream.streams.arrays import FloatArray
 from mapstream.streams.geometry import SE3, so3_exp
 
 LENGTH_M, WIDTH_M, HEIGHT_M = 20.0, 15.0, 4.0
+_SIZE_M = (LENGTH_M, WIDTH_M, HEIGHT_M)
 _NUM_CRATES = 22
 _CLEARANCE_M = 0.9  # between the path and what stands beside it
 _PILLARS = ((3.6, 0.0), (-3.6, 0.0), (0.0, 3.4), (0.0, -3.4), (7.6, 4.6), (-7.6, -4.6))
@@ -47,23 +48,13 @@ def hall(
     """Return a hall whose things stand beside a path (N, 2) [m]."""
     rng = np.random.default_rng(seed)
     painter = Painter(rng, texel_m, is_colored=False)
-    surfaces = [*_shell(painter), *_pillars(painter), *_crates(painter, path)]
+    surfaces = [
+        *shell(_SIZE_M, *(partial(paint, painter) for paint in (_wall, _floor, _ceiling))),
+        *_pillars(painter),
+        *_crates(painter, path),
+    ]
     tags = tuple(_tag(number, tag_size_m) for number in range(num_tags))
     return Hall((*surfaces, *map(_tag_surface, tags)), tags)
-
-
-def _shell(painter: Painter) -> list[Surface]:
-    x, y, z = LENGTH_M / 2, WIDTH_M / 2, HEIGHT_M
-    wall, down = partial(_wall, painter), [0, 0, -z]
-    shell = partial(rectangle, is_shell=True)
-    return [
-        shell("wall_north", [-x, y, z], [2 * x, 0, 0], down, wall),
-        shell("wall_east", [x, y, z], [0, -2 * y, 0], down, wall),
-        shell("wall_south", [x, -y, z], [-2 * x, 0, 0], down, wall),
-        shell("wall_west", [-x, -y, z], [0, 2 * y, 0], down, wall),
-        shell("floor", [-x, y, 0], [2 * x, 0, 0], [0, -2 * y, 0], partial(_floor, painter)),
-        shell("ceiling", [-x, -y, z], [2 * x, 0, 0], [0, 2 * y, 0], partial(_ceiling, painter)),
-    ]
 
 
 def _wall(painter: Painter, size_m: tuple[float, float]) -> Picture:

@@ -8,11 +8,11 @@ from functools import partial
 import numpy as np
 
 from mapstream.recordings.worlds.paint import Painter, Picture
-from mapstream.recordings.worlds.surfaces import Paint, Surface, box_outline, prism, rectangle
+from mapstream.recordings.worlds.surfaces import Paint, Surface, box_outline, prism, shell
 from mapstream.streams.arrays import FloatArray
 from mapstream.streams.geometry import SE3, so3_exp
 
-LENGTH_M, WIDTH_M, HEIGHT_M = 5.2, 4.4, 2.6
+_SIZE_M = (5.2, 4.4, 2.6)
 TABLE_HEIGHT_M = 0.75
 _TABLE_M, _BOARD_M, _LEG_M = (1.4, 0.8), 0.04, 0.06
 
@@ -40,26 +40,15 @@ def rgbd_room(seed: int, *, texel_m: float) -> Room:
     rng = np.random.default_rng(seed)
     painter = Painter(rng, texel_m, is_colored=True)
     things = _things(rng)
-    surfaces = [*_shell(painter), *_furniture(painter)]
+    surfaces = [
+        *shell(_SIZE_M, *(partial(paint, painter) for paint in (_wall, _floor, _ceiling))),
+        *_furniture(painter),
+    ]
     fine = Painter(rng, texel_m / 2, is_colored=True)  # seen from near
     for thing in things:
         paint = _one_color(fine, rng.uniform(60, 220), 60, 1500)
         surfaces += prism(thing.name, thing.T_world_thing, thing.outline_m, thing.height_m, paint)
     return Room(tuple(surfaces), things)
-
-
-def _shell(painter: Painter) -> list[Surface]:
-    x, y, z = LENGTH_M / 2, WIDTH_M / 2, HEIGHT_M
-    wall, down = partial(_wall, painter), [0, 0, -z]
-    shell = partial(rectangle, is_shell=True)
-    return [
-        shell("wall_north", [-x, y, z], [2 * x, 0, 0], down, wall),
-        shell("wall_east", [x, y, z], [0, -2 * y, 0], down, wall),
-        shell("wall_south", [x, -y, z], [-2 * x, 0, 0], down, wall),
-        shell("wall_west", [-x, -y, z], [0, 2 * y, 0], down, wall),
-        shell("floor", [-x, y, 0], [2 * x, 0, 0], [0, -2 * y, 0], partial(_floor, painter)),
-        shell("ceiling", [-x, -y, z], [2 * x, 0, 0], [0, 2 * y, 0], partial(_ceiling, painter)),
-    ]
 
 
 def _wall(painter: Painter, size_m: tuple[float, float]) -> Picture:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import cv2
 import numpy as np
@@ -94,6 +95,23 @@ def rectangle(
         texel_m=width / picture.shape[1],
         is_shell=is_shell,
     )
+
+
+def shell(
+    size_m: tuple[float, float, float], wall: Paint, floor: Paint, ceiling: Paint
+) -> list[Surface]:
+    """Return a room's walls, floor and ceiling, seen from inside; the floor's middle is the origin."""
+    x, y, z = size_m[0] / 2, size_m[1] / 2, size_m[2]
+    down = [0, 0, -z]
+    inside = partial(rectangle, is_shell=True)
+    return [
+        inside("wall_north", [-x, y, z], [2 * x, 0, 0], down, wall),
+        inside("wall_east", [x, y, z], [0, -2 * y, 0], down, wall),
+        inside("wall_south", [x, -y, z], [-2 * x, 0, 0], down, wall),
+        inside("wall_west", [-x, -y, z], [0, 2 * y, 0], down, wall),
+        inside("floor", [-x, y, 0], [2 * x, 0, 0], [0, -2 * y, 0], floor),
+        inside("ceiling", [-x, -y, z], [2 * x, 0, 0], [0, 2 * y, 0], ceiling),
+    ]
 
 
 def prism(

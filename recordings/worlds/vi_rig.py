@@ -78,9 +78,9 @@ class ViCameraConfig(BaseModel):
     """In the middle of the image; 5/8 of the width where nothing is said: 77 degrees."""
     lens: LensName = "radtan"
     rate_hz: PositiveFloat = 20.0
-    readout_s: NonNegativeFloat = 0.0
+    readout_s: float = Field(default=0.0, ge=0, le=0.1)
     """Of a rolling shutter, from the first row to the last; an image's stamp is that of its first row."""
-    exposure_s: NonNegativeFloat = 0.0
+    exposure_s: float = Field(default=0.0, ge=0, le=0.1)
     """Motion blur: the mean of `blur_samples` moments around the stamp."""
     blur_samples: int = Field(default=5, ge=2)
     noise: NonNegativeFloat = 2.0
