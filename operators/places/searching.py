@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
@@ -46,45 +47,43 @@ class Compared:
 
 
 class Search:
-    """Compares vertices with those that were put before, but for the newest of the same mission.
+    """Compares vertices with those that came before; missions come one after another, or take turns.
 
-    A vertex is put among what is compared with only when the gap is over, so that the nearest descriptors are
-    never those of the moment before.
+    A vertex is put among what its own mission is compared with only when the gap is over, so that the nearest
+    descriptors are never those of the moment before.
     """
 
     def __init__(self, config: SearchConfig, projections: Projections | None = None) -> None:
         self._config, self._projections = config, dict(projections or {})
-        self._database = PlaceDatabase(config.look, self._projections)
-        self._waiting: list[int] = []  # vertices of the mission of now, in the order of time
-
-    def begin_mission(self) -> None:
-        """Forget what may not be compared with the next mission."""
-        if not self._config.between:
-            self._database = PlaceDatabase(self._config.look, self._projections)
+        self._databases: dict[int, PlaceDatabase] = {}  # by mission, or one of all
+        self._waiting: dict[int, deque[int]] = {}  # by mission: vertices that are not put there yet
 
     def compare(
         self, map_: Map, vertex: int, views: VertexViews, landmarks_map: FloatArray
     ) -> Compared | None:
         """Compare the next vertex of a mission; None as long as there is nothing to compare it with."""
-        stamps_ns = map_.vertices.stamp_ns
-        until_ns = stamps_ns[vertex] - round(self._config.min_gap_s * 1e9)
-        while self._config.within and self._waiting and stamps_ns[self._waiting[0]] <= until_ns:
-            self._put(map_, self._waiting.pop(0), views)
-        self._waiting.append(vertex)
-        if not len(self._database):
+        mission = int(map_.vertices.mission[vertex])
+        database = self._database(mission)
+        until_ns = map_.vertices.stamp_ns[vertex] - round(self._config.min_gap_s * 1e9)
+        for other, waiting in self._waiting.items():
+            is_own = other == mission
+            while waiting and (self._config.within if is_own else self._config.between):
+                if is_own and map_.vertices.stamp_ns[waiting[0]] > until_ns:
+                    break
+                put = waiting.popleft()
+                database.add(map_, put, views.at(put))
+        self._waiting.setdefault(mission, deque()).append(vertex)
+        if not len(database):
             return None
         seed = seed_of(map_.vertices.id[vertex].tobytes())
-        found = recognize(views.at(vertex), self._database, landmarks_map, self._config, seed=seed)
+        found = recognize(views.at(vertex), database, landmarks_map, self._config, seed=seed)
         return Compared(vertex, found)
 
-    def end_mission(self, map_: Map, views: VertexViews) -> None:
-        """Put all of the mission among what the next one is compared with."""
-        for vertex in self._waiting:
-            self._put(map_, vertex, views)
-        self._waiting.clear()
-
-    def _put(self, map_: Map, vertex: int, views: VertexViews) -> None:
-        self._database.add(map_, vertex, views.at(vertex))
+    def _database(self, mission: int) -> PlaceDatabase:
+        key = -1 if self._config.between else mission
+        if key not in self._databases:
+            self._databases[key] = PlaceDatabase(self._config.look, self._projections)
+        return self._databases[key]
 
 
 def search(
@@ -95,12 +94,10 @@ def search(
     views = VertexViews(map_, config.kinds)
     searching = Search(config, projections)
     for mission in range(len(map_.missions)):
-        searching.begin_mission()
         for vertex in map_.vertices_of(mission)[:: config.every].tolist():
             compared = searching.compare(map_, vertex, views, landmarks_map)
             if compared is not None:
                 yield compared
-        searching.end_mission(map_, views)
 
 
 def landmark_positions(map_: Map) -> FloatArray:

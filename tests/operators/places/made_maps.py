@@ -1,8 +1,9 @@
 """Maps of a room whose points have descriptors, flown through on a circle, with drift."""
 
 import zlib
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -95,8 +96,7 @@ def drifted(truth: list[SE3], scale: float = 1.0) -> list[SE3]:
     return poses
 
 
-def flown(
-    map_: Map,
+def flight(
     place: Room,
     mission: str,
     truth: list[SE3],
@@ -105,8 +105,8 @@ def flown(
     from_origin: bool = False,
     drift: float = 1.0,
     kinds: tuple[tuple[str, Room], ...] = (),
-) -> Map:
-    """Add a mission along these poses; points get new tracks with each lap.
+) -> Submap:
+    """A mission along these poses; points get new tracks with each lap.
 
     `from_origin`: its frame is that of its first pose, as an odometry's is; otherwise it is the room's.
     """
@@ -144,8 +144,22 @@ def flown(
                     covariance=np.diag([1e-4] * 3 + [1e-3] * 3),
                 )
             )
-    submap = Submap(mission_id=mission, index=0, keyframes=tuple(keyframes), edges=tuple(edges))
-    return create_landmarks(append_submap(map_, submap))[0]
+    return Submap(mission_id=mission, index=0, keyframes=tuple(keyframes), edges=tuple(edges))
+
+
+def flown(map_: Map, *args: Any, **options: Any) -> Map:  # noqa: ANN401  # those of `flight`
+    """Add a mission to a map, with its landmarks."""
+    return create_landmarks(append_submap(map_, flight(*args, **options)))[0]
+
+
+def in_parts(submap: Submap, size: int) -> list[Submap]:
+    """The same mission as submaps of so many keyframes, each beginning with the last one of that before."""
+    parts: list[Submap] = []
+    for first in range(0, len(submap.keyframes) - 1, size):
+        keyframes = submap.keyframes[first : first + size + 1]
+        edges = submap.edges[first : first + size]
+        parts.append(replace(submap, index=len(parts), keyframes=keyframes, edges=edges))
+    return parts
 
 
 def _seed(mission: str, k: int, name: str) -> int:
