@@ -1,4 +1,4 @@
-"""How a camera maps rays to pixels: the parameters, checked; projection itself is computer vision's.
+"""How a camera maps rays to pixels: the parameters, checked; `camera_models` has the maps themselves.
 
 Models: pinhole, and the unified model (Mei and Rives, Single View Point Omnidirectional Camera
 Calibration from Planar Grids, ICRA 2007). Distortions are named as in maplab and ROS.

@@ -37,6 +37,9 @@ class Distorted:
 
 def distort(kind: Distortion, parameters: FloatArray, points: FloatArray) -> Distorted:
     """Bend points (N, 2) of the normalised plane as a lens does."""
+    if kind == "none":
+        straight = np.broadcast_to(np.eye(2), (len(points), 2, 2))
+        return Distorted(np.where(np.isfinite(points), points, np.nan), straight)
     r = np.hypot(points[:, 0], points[:, 1])
     with np.errstate(all="ignore"):  # what is beyond the limit may overflow, and becomes NaN below
         value, slope = _RADII[kind](r, parameters)
