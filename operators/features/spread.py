@@ -66,12 +66,15 @@ def apart(px: Float32Array, distance_px: float, live_px: Float32Array | None = N
     num_live = len(live_px)
     all_px = np.concatenate([live_px, px])
     kept = np.ones(len(all_px), dtype=bool)
+    pairs = np.empty((0, 2), np.int64)  # the stronger first
     if len(all_px) > 1 and distance_px > 0:
         pairs = cKDTree(all_px).query_pairs(distance_px, output_type="ndarray")
         pairs = pairs[pairs[:, 1] >= num_live]
-        for winner, loser in pairs[np.lexsort(pairs.T[::-1])].tolist():
-            if kept[winner]:  # all that could have suppressed it came before
-                kept[loser] = False
+    while len(pairs):  # points that none stronger threatens any more remove their neighbours
+        is_safe = kept.copy()
+        is_safe[pairs[:, 1]] = False
+        kept[pairs[is_safe[pairs[:, 0]], 1]] = False
+        pairs = pairs[~is_safe[pairs[:, 0]] & kept[pairs].all(axis=1)]
     return kept[num_live:]
 
 
