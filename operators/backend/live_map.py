@@ -23,6 +23,7 @@ from mapstream.operators.estimation.starts.first_fixes import FirstFixes, headed
 from mapstream.operators.estimation.starts.inertial_start import dead_reckoned, with_known_biases
 from mapstream.operators.estimation.states import initial_values, with_solution
 from mapstream.operators.estimation.symbols import PoseSymbols
+from mapstream.operators.maps.quality import require_no_worse
 from mapstream.recordings.maps.build import add_edges, anchored
 from mapstream.recordings.maps.ids import as_keys
 from mapstream.recordings.maps.model import Map
@@ -52,6 +53,7 @@ class LiveMap:
         self.map = Map.empty()
         self._T_map_first = T_map_first or SE3.identity()  # where the first mission begins
         self.num_contradictions = 0
+        self.refused = ""  # why the last batch did not count, if it did not
         self._config = config
         self._problem = IncrementalProblem()
         self._symbols = PoseSymbols()
@@ -101,13 +103,21 @@ class LiveMap:
     def finish(self) -> OptimizationReport:
         """Optimise the whole map in one batch; its states and switches are the final ones.
 
+        A solution that bends missions far beyond the noise of their own motion is refused: then the map stays as it
+        was, and `refused` says why.
+
         Raises:
             EstimationError: If the map has no finite solution.
         """
         if self._judge is not None:
             self._solve_with(np.empty(0, dtype=np.int64), is_whole=True)
-        self.map = self.ordered()
-        return self._optimize()
+        before = self.map = self.ordered()
+        report = self._optimize()
+        try:
+            require_no_worse(before, self.map, may_switch=self._config.is_robust)
+        except EstimationError as error:
+            self.map, self.refused = before, str(error)
+        return report
 
     def _optimize(self) -> OptimizationReport:
         self.map, report = optimize_map(self.map, self._config)

@@ -75,7 +75,9 @@ class Optimizer(Operator[Inputs, Outputs]):
             warn("no submap came, so there is no map")
             return
         report = await offload(self._live.finish)
-        for row in report.switched_off:
+        if self._live.refused:
+            warn(f"the last optimisation of the whole map did not count: {self._live.refused}")
+        for row in () if self._live.refused else report.switched_off:
             warn(f"loop closure {row} contradicts the rest and was switched off")
         await outputs.maps.send(self._live.ordered())
 

@@ -9,6 +9,8 @@ from mapstream.operators.backend.live_map import LiveMap
 from mapstream.operators.backend.optimizer import Optimizer, OptimizerConfig
 from mapstream.operators.estimation.batch import OptimizeConfig, optimize_map
 from mapstream.operators.estimation.states import initial_values, poses_from
+from mapstream.operators.maps.quality import map_quality
+from mapstream.operators.operator import Context
 from mapstream.operators.testing import run_operator
 from mapstream.streams.geometry import SE3
 from mapstream.streams.messages.estimates import LoopReport
@@ -147,3 +149,29 @@ def test_G8_a_new_mission_begins_without_the_symbols_of_the_last() -> None:
     assert len(live.map.vertices) == 2 * len(before)
     assert live.map.missions.is_base_frame_known.tolist() == [True, False]
     np.testing.assert_allclose(live.map.vertices.T_mission_base[: len(before)], before, atol=1e-9)
+
+
+@pytest.mark.anyio
+async def test_K2_a_last_batch_that_bends_the_map_does_not_count() -> None:
+    """Without odometry, a false loop that may not be switched off has its way."""
+    rng = np.random.default_rng(3)
+    drive = worlds.submaps(worlds.circle(31, laps=1), rng)
+    false = replace(worlds.false_loop(2, 25, rng), is_switchable=False)
+    reports = [LoopReport(stamp_ns=s.stamp_ns, edges=()) for s in drive]
+    reports[-1] = replace(reports[-1], edges=(false,))
+    blind = OptimizeConfig(without=("odometry",), underconstrained="prior")
+    found = Context()
+
+    sent = await run_operator(
+        Optimizer(OptimizerConfig(batch=blind)), run_context=found, submaps=drive, loops=reports
+    )
+
+    live = LiveMap(OptimizeConfig())
+    for submap in drive:
+        live.append(submap)
+    live.close_loops([false])
+    bent, _ = optimize_map(live.map, blind)
+    strain = map_quality(live.map).worst
+    assert map_quality(sent["maps"][-1]).worst < 1.2 * strain
+    assert map_quality(bent).worst > 2 * strain
+    assert any("did not count: the map got worse" in each for each in found.activity.warnings)
