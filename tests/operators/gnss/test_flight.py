@@ -14,6 +14,7 @@ from tests.operators.flights import NOISE, Flight, mapped
 pytestmark = pytest.mark.anyio
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(2))
 async def test_F9_a_flight_with_satellites_of_2_cm_and_a_lever_arm(seed: int) -> None:
     """Position on Earth within 3 cm at every pose, though the odometry drifts by 1 % and turns away."""

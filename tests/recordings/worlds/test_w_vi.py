@@ -55,6 +55,7 @@ def grey(image: EncodedImage) -> np.ndarray:
     return np.asarray(cv2.imdecode(image.data, cv2.IMREAD_GRAYSCALE))
 
 
+@pytest.mark.slow
 def test_R9_the_same_seed_gives_the_same_bytes(tmp_path: Path) -> None:
     """Images are drawn by several threads, and yet come out the same."""
     paths = [tmp_path / name for name in ("a.mcap", "b.mcap", "c.mcap")]
@@ -115,6 +116,7 @@ def test_A1_the_imu_follows_the_truth_and_the_biases_it_tells() -> None:
     assert np.linalg.norm(so3_log(R.T @ last.T_odom_base.R @ R_base_imu)) < 0.01
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("readout_s", [0.0, 0.02])
 def test_A13_A22_tags_are_seen_where_the_truth_puts_them(readout_s: float) -> None:
     """Within a pixel of the corners that OpenCV finds, also on a shutter that rolls while the robot turns."""
@@ -154,6 +156,7 @@ def test_A13_A22_tags_are_seen_where_the_truth_puts_them(readout_s: float) -> No
     assert np.median(np.abs(misses)) < 0.6
 
 
+@pytest.mark.slow
 def test_every_camera_sees_corners_everywhere() -> None:
     """At least 300 FAST corners in each image of a lap, at full detail and half the width."""
     config = {
