@@ -1,7 +1,7 @@
 """Levenberg-Marquardt on a bundle and the rest of the map's problem together.
 
 gtsam linearises the rest; the points of the bundle are eliminated in NumPy, all at once. One factor object per
-observation would cost more than everything else (docs/decisions/0009-bundle-adjustment.md).
+observation would cost more than everything else (docs/decisions/0010-bundle-adjustment.md).
 Source: Marquardt, SIAM 1963; Triggs et al., Bundle Adjustment: A Modern Synthesis, 2000.
 """
 
@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -22,6 +23,7 @@ from mapstream.operators.estimation.vision.bundle import Bundle
 from mapstream.operators.estimation.vision.bundle_state import (
     State,
     Used,
+    all_errors,
     chi2_by_family,
     linearized,
     plausible,
@@ -154,11 +156,12 @@ class _Descent:
     def _checked(self, here: _Point) -> _Point:
         """Return the same place after a look at when and by whom points were seen."""
         self.bundle = refreshed(self.bundle, here.values, here.state)
-        self.used = plausible(self.bundle, here.state)
-        return replace(here, error=self._error(here.values, here.state))
+        found = all_errors(self.bundle, here.state)
+        self.used = plausible(self.bundle, found)
+        return replace(here, error=self._error(here.values, found))
 
-    def _error(self, values: Values, state: State) -> float:
-        bundle = sum(chi2_by_family(self.bundle, state, self.used).values())
+    def _error(self, values: Values, found: Sequence[FloatArray]) -> float:
+        bundle = sum(chi2_by_family(self.bundle, found, self.used).values())
         return float(self.graph.error(values)) + 0.5 * bundle
 
     def _stepped(self, here: _Point, damping: float) -> tuple[_Point, float]:
@@ -173,7 +176,7 @@ class _Descent:
                 rows = self.bundle.landmarks[kept].tolist()
                 moved[kept] = [values.atPoint3(key_of("landmark", row)) for row in rows]
             state = state_of(self.bundle, values, moved)
-            error = self._error(values, state)
+            error = self._error(values, all_errors(self.bundle, state))
             if error <= here.error:
                 return _Point(values, state, error), max(damping / 10, _MIN_LAMBDA)
             damping *= 10
@@ -218,7 +221,8 @@ def reduced_normal(bundle: Bundle, graph: Graph, values: Values) -> tuple[csc_ar
     rest, gradient = graph_normal(
         soft, columns.values, columns.of_graph(sorted(soft.keys())), columns.num
     )
-    linear = Linear(rest, gradient, linearized(bundle, state, plausible(bundle, state)))
+    used = plausible(bundle, all_errors(bundle, state))
+    linear = Linear(rest, gradient, linearized(bundle, state, used))
     left = eliminate(bundle.pairs, linear.blocks, 0.0, columns.is_kept | bundle.points_stay)
     return joined(linear, left, columns, bundle.pairs)[0], columns
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -60,23 +61,25 @@ def in_vertices(bundle: Bundle, state: State) -> tuple[FloatArray, FloatArray]:
     return R, np.einsum("nji,nj->ni", R, away)
 
 
-def plausible(bundle: Bundle, state: State) -> Used:
+def all_errors(bundle: Bundle, state: State) -> list[FloatArray]:
+    """Return the errors (N, M) of each of the sightings, in units of standard deviations."""
+    _, p_vertex = in_vertices(bundle, state)
+    return [
+        errors(seen, p_vertex[seen.pair], state.sensors[seen.sensor]) for seen in bundle.sightings
+    ]
+
+
+def plausible(bundle: Bundle, found: Sequence[FloatArray]) -> Used:
     """Return which observations fit so well that they may be true: in front of the sensor, within the gate."""
-    _, p_vertex = in_vertices(bundle, state)
-    masks = []
-    for seen in bundle.sightings:
-        found = errors(seen, p_vertex[seen.pair], state.sensors[seen.sensor])
-        masks.append(np.linalg.norm(found, axis=1) <= seen.gate)  # NaN is not
-    return tuple(masks)
+    pairs = zip(bundle.sightings, found, strict=True)
+    return tuple(np.linalg.norm(each, axis=1) <= seen.gate for seen, each in pairs)  # NaN is not
 
 
-def chi2_by_family(bundle: Bundle, state: State, used: Used) -> dict[str, float]:
+def chi2_by_family(bundle: Bundle, found: Sequence[FloatArray], used: Used) -> dict[str, float]:
     """Return the costs of observations under their losses, as sums of squares."""
-    _, p_vertex = in_vertices(bundle, state)
     sums: dict[str, float] = {}
-    for seen, mask in zip(bundle.sightings, used, strict=True):
-        found = errors(seen, p_vertex[seen.pair], state.sensors[seen.sensor])
-        cost, _ = chi2_and_weights(seen, found, mask)
+    for seen, each, mask in zip(bundle.sightings, found, used, strict=True):
+        cost, _ = chi2_and_weights(seen, each, mask)
         sums[seen.family] = sums.get(seen.family, 0.0) + float(cost.sum())
     return sums
 
@@ -102,28 +105,25 @@ def linearized(bundle: Bundle, state: State, used: Used) -> Blocks:
         takes_part = (weights > 0)[:, None]
         e = np.where(takes_part, found.errors, 0.0) * root
         A = np.where(takes_part[:, :, None], found.by_vertex_point, 0.0) * root[:, :, None]
-        At = np.swapaxes(A, 1, 2)
-        information += summed(seen.pair, (At @ A).reshape(-1, 9), num)
-        gradient += summed(seen.pair, np.einsum("nij,nj->ni", At, e), num)
+        information += summed(seen.pair, np.einsum("nki,nkj->nij", A, A).reshape(-1, 9), num)
+        gradient += summed(seen.pair, np.einsum("nki,nk->ni", A, e), num)
         if bundle.sensors[seen.sensor].keys:
             J = _by_sensor(bundle.sensors[seen.sensor], found)
             J = np.where(takes_part[:, :, None], J, 0.0) * root[:, :, None]
-            extras.append((seen, J, At @ J, e))
+            extras.append((seen, J, np.swapaxes(A, 1, 2) @ J, e))
     blocks = pose_blocks(bundle.pairs, R, p_vertex, information.reshape(-1, 3, 3), gradient)
     return _with_sensors(bundle, blocks, (R, p_vertex), extras) if extras else blocks
 
 
 def _by_sensor(sensor: Sensor, found: Residuals) -> FloatArray:
     """Return derivatives (N, M, B) by all that is refined of a sensor, in the order of its keys."""
-    columns = [
-        derivative
-        for key, derivative in (
-            (sensor.mount_key, found.by_mount),
-            (sensor.intrinsics_key, found.by_intrinsics),
-            (sensor.time_offset_key, found.by_time_offset),
-        )
-        if key is not None
-    ]
+    columns = []
+    if sensor.mount_key is not None:
+        columns.append(found.by_mount)
+    if sensor.intrinsics_key is not None:
+        columns.append(found.by_intrinsics)
+    if sensor.time_offset_key is not None:
+        columns.append(found.by_time_offset)
     return np.concatenate(columns, axis=2)
 
 

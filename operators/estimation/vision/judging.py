@@ -11,14 +11,13 @@ from mapstream.operators.estimation.states import Values
 from mapstream.operators.estimation.vision.bundle import Bundle
 from mapstream.operators.estimation.vision.bundle_solver import refreshed
 from mapstream.operators.estimation.vision.bundle_state import (
+    all_errors,
     chi2_by_family,
     counts_by_family,
-    in_vertices,
     plausible,
     rows_left_out,
     state_of,
 )
-from mapstream.operators.estimation.vision.sightings import errors
 from mapstream.recordings.maps.model import Map
 
 
@@ -26,9 +25,10 @@ def judged(bundle: Bundle, before: Values, after: Values) -> tuple[dict[str, Kin
     """Return reports by family on the observations that take part at the end, and how many do not."""
     state = state_of(bundle, after)
     now = refreshed(bundle, after, state)
-    used = plausible(now, state)
-    chi2_after = chi2_by_family(now, state, used)
-    chi2_before = chi2_by_family(bundle, state_of(bundle, before), used)
+    found = all_errors(now, state)
+    used = plausible(now, found)
+    chi2_after = chi2_by_family(now, found, used)
+    chi2_before = chi2_by_family(bundle, all_errors(bundle, state_of(bundle, before)), used)
     counts = counts_by_family(now, used)
     reports = {
         family: KindReport(
@@ -45,7 +45,7 @@ def without_outliers(map_: Map, bundle: Bundle, values: Values) -> Map:
     """Return the map in which observations that cannot be true have no landmark any more."""
     state = state_of(bundle, values)
     now = refreshed(bundle, values, state)
-    rows = rows_left_out(now, plausible(now, state))
+    rows = rows_left_out(now, plausible(now, all_errors(now, state)))
     if not len(rows):
         return map_
     landmark = map_.observations.landmark.copy()
@@ -55,14 +55,12 @@ def without_outliers(map_: Map, bundle: Bundle, values: Values) -> Map:
 
 def rms_px(bundle: Bundle, values: Values) -> dict[tuple[int, str], float]:
     """Return the root mean square of the reprojection errors of each camera, by mission and name [px]."""
-    state = state_of(bundle, values)
-    used = plausible(bundle, state)
-    _, p_vertex = in_vertices(bundle, state)
-    sums: dict[tuple[int, str], float] = {}
-    for seen, mask in zip(bundle.sightings, used, strict=True):
-        if seen.family != "keypoints":
-            continue
-        sensor = bundle.sensors[seen.sensor]
-        found = errors(seen, p_vertex[seen.pair], state.sensors[seen.sensor]) * seen.sigmas[:, None]
-        sums[sensor.mission, sensor.name] = float(np.sqrt((found[mask] ** 2).sum(axis=1).mean()))
-    return sums
+    found = all_errors(bundle, state_of(bundle, values))
+    used = plausible(bundle, found)
+    rms: dict[tuple[int, str], float] = {}
+    for seen, each, mask in zip(bundle.sightings, found, used, strict=True):
+        if seen.family == "keypoints":
+            sensor = bundle.sensors[seen.sensor]
+            away_px = (each * seen.sigmas[:, None])[mask]
+            rms[sensor.mission, sensor.name] = float(np.sqrt((away_px**2).sum(axis=1).mean()))
+    return rms

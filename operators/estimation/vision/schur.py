@@ -65,19 +65,20 @@ def pose_blocks(
         information: Shape (P, 3, 3).
         gradient: Shape (P, 3).
     """
-    G = np.concatenate([hat(p_vertex), np.tile(-np.eye(3), (len(R), 1, 1))], axis=2)
-    MG = information @ G
-    by_pose = np.swapaxes(G, 1, 2) @ MG
-    by_point = R @ information @ np.swapaxes(R, 1, 2)
-    toward_pose = np.einsum("nji,nj->ni", G, gradient)
-    toward_point = np.einsum("nij,nj->ni", R, gradient)
+    K = hat(p_vertex)
+    MK = information @ K
+    RM = R @ information
+    by_pose = np.empty((len(R), 6, 6))
+    by_pose[:, :3, :3], by_pose[:, :3, 3:] = -K @ MK, -np.swapaxes(MK, 1, 2)
+    by_pose[:, 3:, :3], by_pose[:, 3:, 3:] = -MK, information
+    toward_pose = np.concatenate([np.cross(gradient, p_vertex), -gradient], axis=1)
     num, size = pairs.num_poses, pairs.num_points
     return Blocks(
         pose=summed(pairs.pose, by_pose, num),
         pose_gradient=summed(pairs.pose, toward_pose, num),
-        point=summed(pairs.point, by_point, size),
-        point_gradient=summed(pairs.point, toward_point, size),
-        cross=R @ MG,
+        point=summed(pairs.point, RM @ np.swapaxes(R, 1, 2), size),
+        point_gradient=summed(pairs.point, np.einsum("nij,nj->ni", R, gradient), size),
+        cross=np.concatenate([R @ MK, -RM], axis=2),
         extra=np.zeros((0, 0)),
         extra_gradient=np.zeros(0),
         pose_extra=np.zeros((num, 6, 0)),

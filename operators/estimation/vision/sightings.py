@@ -80,9 +80,16 @@ class Residuals:
 
     errors: FloatArray  # (N, M); NaN where the point has no pixel
     by_vertex_point: FloatArray  # (N, M, 3) by p_vertex
-    by_mount: FloatArray  # (N, M, 6) by T_base_sensor, rotation first, on the right
+    by_sensor_point: FloatArray  # (N, M, 3) by p_sensor
+    p_sensor: FloatArray  # (N, 3)
     by_intrinsics: FloatArray  # (N, M, P)
     by_time_offset: FloatArray  # (N, M, 1) [1/s]
+
+    @property
+    def by_mount(self) -> FloatArray:
+        """Return derivatives (N, M, 6) by T_base_sensor, rotation first, on the right."""
+        turned = self.by_sensor_point @ hat(self.p_sensor)
+        return np.concatenate([turned, -self.by_sensor_point], axis=2)
 
 
 def errors(seen: Sightings, p_vertex: FloatArray, sensor: SensorState) -> FloatArray:
@@ -104,8 +111,11 @@ def residuals(seen: Sightings, p_vertex: FloatArray, sensor: SensorState) -> Res
         predicted, by_sensor = p_sensor, np.tile(np.eye(3), (len(p_sensor), 1, 1))
         by_intrinsics = np.zeros((len(p_sensor), 3, 0))
     else:
-        predicted, _ = project(sensor.calibration, p_sensor)
         by_sensor, by_intrinsics = projection_jacobians(sensor.calibration, p_sensor)
+        bent = by_intrinsics[
+            :, [0, 1], [0, 1]
+        ]  # by the focal lengths: the point on the image plane
+        predicted = bent * sensor.calibration.focal_px + sensor.calibration.center_px
     by_sensor = by_sensor * weights[:, :, None]
     R_base_sensor = sensor.T_base_sensor[:3, :3]
     size = by_sensor.shape[1]
@@ -117,11 +127,11 @@ def residuals(seen: Sightings, p_vertex: FloatArray, sensor: SensorState) -> Res
         rate, velocity = seen.moments.twists[:, :3], seen.moments.twists[:, 3:]
         drift = np.cross(p_moment, rate) - velocity
         by_time = by_moment @ drift[:, :, None]
-    by_mount = np.concatenate([by_sensor @ hat(p_sensor), -by_sensor], axis=2)
     return Residuals(
         errors=(predicted - seen.measured) * weights,
         by_vertex_point=by_vertex,
-        by_mount=by_mount,
+        by_sensor_point=by_sensor,
+        p_sensor=p_sensor,
         by_intrinsics=by_intrinsics * weights[:, :, None],
         by_time_offset=by_time,
     )
