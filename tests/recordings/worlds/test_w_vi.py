@@ -218,6 +218,20 @@ def test_blind_times_are_black_or_blank() -> None:
     assert means["left", 0][1] > 15
 
 
+def test_long_exposures_blur_what_moves() -> None:
+    """In images without loss: edges of the same view are weaker."""
+    options = {"rate_hz": 1.0, "noise": 0.0, "format": "png", "width_px": 320, "height_px": 240}
+    views = [
+        of_type(small(cameras=("left",), camera=options | {"exposure_s": s}), EncodedImage)[0]
+        for s in (0.0, 0.1)
+    ]
+
+    sharp, blurred = (cv2.Laplacian(grey(view), cv2.CV_64F).std() for view in views)
+
+    assert {view.format for view in views} == {"png"}
+    assert blurred < 0.7 * sharp
+
+
 def test_K11_a_wrong_rig_and_a_wrong_clock_can_be_asked_for() -> None:
     wrong = small(
         cameras=("left", "rear"),
