@@ -11,7 +11,7 @@ GRAY = np.arange(48, dtype=np.uint8).reshape(6, 8)
 _KINECT = np.full((480, 640), 90, np.uint8)
 DEPTH = np.array([[0, 5000, 65535], [10000, 1, 2500]], np.uint16)
 
-_CAMERA = """%YAML:1.0
+EUROC_CAMERA = """%YAML:1.0
 sensor_type: camera
 T_BS:
   cols: 4
@@ -23,7 +23,7 @@ intrinsics: [458.654, 457.296, 367.215, 248.375]
 distortion_model: radial-tangential
 distortion_coefficients: [-0.28, 0.07, 0.0002, 1.7e-05]
 """
-_IMU = """sensor_type: imu
+EUROC_IMU = """sensor_type: imu
 T_BS: {cols: 4, rows: 4, data: [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]}
 gyroscope_noise_density: 1.6968e-04
 gyroscope_random_walk: 1.9393e-05
@@ -36,12 +36,12 @@ def euroc(folder: Path) -> Path:
     """Write two cameras, an IMU and truth in the ASL layout."""
     texts = {
         "imu0/data.csv": "#timestamp [ns],w_RS_S_x\n1403715273262142976,1,2,3,4,5,6\n",
-        "imu0/sensor.yaml": _IMU,
+        "imu0/sensor.yaml": EUROC_IMU,
         "state_groundtruth_estimate0/data.csv": "#t\n1403715273262142976,1,2,3,1,0,0,0\n",
     }
     for name in ("cam0", "cam1"):
         listing = "#timestamp [ns],filename\n1403715273262142976,a.png\n"
-        texts |= {f"{name}/data.csv": listing, f"{name}/sensor.yaml": _CAMERA}
+        texts |= {f"{name}/data.csv": listing, f"{name}/sensor.yaml": EUROC_CAMERA}
         (folder / "mav0" / name / "data").mkdir(parents=True)
         cv2.imwrite(str(folder / "mav0" / name / "data" / "a.png"), GRAY)
     for name, content in texts.items():

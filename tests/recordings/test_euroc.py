@@ -17,29 +17,10 @@ from mapstream.streams.errors import ConfigError, RecordingError
 from mapstream.streams.messages.sensors import EncodedImage
 from mapstream.streams.sensors import CameraSensor, ImuSensor
 from tests.data import shared
+from tests.recordings.made_datasets import EUROC_CAMERA, EUROC_IMU
 
 IMU = "#timestamp [ns],w_RS_S_x [rad s^-1],...\n1403715273262142976,1,2,3,4,5,6\n1403715273267142976,1,2,3,4,5,7\n"
 TRUTH = "#timestamp,...\n1403715273262142976,1,2,3,1,0,0,0,4,5,6,.1,.2,.3,.4,.5,.6\n"
-CAMERA = """%YAML:1.0
-sensor_type: camera
-T_BS:
-  cols: 4
-  rows: 4
-  data: [0, -1, 0, 0.1, 1, 0, 0, 0.2, 0, 0, 1, 0.3, 0, 0, 0, 1]
-resolution: [752, 480]
-camera_model: pinhole
-intrinsics: [458.654, 457.296, 367.215, 248.375]
-distortion_model: radial-tangential
-distortion_coefficients: [-0.28, 0.07, 0.0002, 1.7e-05]
-"""
-IMU_SENSOR = """%YAML:1.0
-sensor_type: imu
-T_BS: {cols: 4, rows: 4, data: [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]}
-gyroscope_noise_density: 1.6968e-04
-gyroscope_random_walk: 1.9393e-05
-accelerometer_noise_density: 2.0000e-3
-accelerometer_random_walk: 3.0000e-3
-"""
 
 
 def decoded(path: Path, topic: str) -> list[Any]:
@@ -52,10 +33,10 @@ def decoded(path: Path, topic: str) -> list[Any]:
 def sequence(tmp_path: Path) -> Path:
     files = {
         "imu0/data.csv": IMU,
-        "imu0/sensor.yaml": IMU_SENSOR,
+        "imu0/sensor.yaml": EUROC_IMU,
         "state_groundtruth_estimate0/data.csv": TRUTH,
         "cam0/data.csv": "#timestamp [ns],filename\n1403715273262142976,a.png\n",
-        "cam0/sensor.yaml": CAMERA,
+        "cam0/sensor.yaml": EUROC_CAMERA,
         "cam0/data/a.png": "not looked into",
     }
     for name, content in files.items():
@@ -104,8 +85,8 @@ def test_A24_euroc_sensors_are_attached(sequence: Path, tmp_path: Path) -> None:
         ("imu0/data.csv", f"{IMU}5,1,2,3,4,5,6\n", RecordingError, "row 3: stamps must increase"),
         ("imu0/data.csv", "#\n1,nan,2,3,4,5,6\n", RecordingError, "row 1: expected finite"),
         ("cam0/data.csv", "1,b.png\n", RecordingError, r"data\.csv:1: expected a stamp and a file"),
-        ("cam0/sensor.yaml", CAMERA.replace("pinhole", "omni"), ConfigError, "got omni"),
-        ("cam0/sensor.yaml", CAMERA.replace("[0, -1", "[0, -2"), ConfigError, "T_BS"),
+        ("cam0/sensor.yaml", EUROC_CAMERA.replace("pinhole", "omni"), ConfigError, "got omni"),
+        ("cam0/sensor.yaml", EUROC_CAMERA.replace("[0, -1", "[0, -2"), ConfigError, "T_BS"),
     ],
 )
 def test_damaged_sequences_are_refused(
