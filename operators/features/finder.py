@@ -8,7 +8,7 @@ from typing import ClassVar
 
 import cv2
 
-from mapstream.operators.features.gray import wrong_size
+from mapstream.operators.images.calibrated import fitted
 from mapstream.operators.operator import Operator, Placement, pipeline, report_loss, warn
 from mapstream.streams.channel import Receiver, Sender
 from mapstream.streams.messages.sensors import CameraFrame
@@ -49,8 +49,8 @@ class FeatureFinder(Operator[Inputs, Outputs]):
         await pipeline(self._looked_at, inputs.frames, send)
 
     def _looked_at(self, frame: CameraFrame) -> ImageFeatures | _Refused:
-        reason = wrong_size(frame)
-        return self.detect(frame) if reason is None else _Refused(frame.stamp_ns, reason)
+        fits = fitted(frame, "drop")
+        return _Refused(frame.stamp_ns, fits) if isinstance(fits, str) else self.detect(fits)
 
 
 @dataclass(frozen=True, slots=True)

@@ -23,25 +23,3 @@ def gray(frame: CameraFrame) -> GrayImage:
     elif image.dtype != np.uint8:
         image = cv2.normalize(np.nan_to_num(image), np.empty(0), 0, 255, cv2.NORM_MINMAX, cv2.CV_8U)
     return np.ascontiguousarray(image, np.uint8)
-
-
-def wrong_size(frame: CameraFrame) -> str | None:
-    """Return what to report of an image that is not as large as its calibration says; None if it is.
-
-    Keypoints of another size would be rays in wrong directions.
-    """
-    camera = frame.camera
-    height, width = frame.image.shape[:2]
-    if camera is None or (width, height) == (camera.width_px, camera.height_px):
-        return None
-    return (
-        f"images of {frame.frame} with {width} x {height} px, though it is calibrated for "
-        f"{camera.width_px} x {camera.height_px} px; resize them, or correct the calibration"
-    )
-
-
-def unlike(left: CameraFrame, right: CameraFrame) -> str | None:
-    """Return what to report of a pair of images of two sizes; None if they have one."""
-    if left.image.shape[:2] == right.image.shape[:2]:
-        return None
-    return f"images of {right.frame} that are not as large as those of {left.frame}"

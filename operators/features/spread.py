@@ -5,11 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
-from mapstream.streams.arrays import Float32Array, IntArray
+from mapstream.streams.arrays import BoolArray, Float32Array, IntArray
 
-BoolArray = npt.NDArray[np.bool_]
 _NO_POINTS = np.empty((0, 2), np.float32)
 
 

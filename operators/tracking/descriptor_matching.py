@@ -14,10 +14,9 @@ import numpy.typing as npt
 from pydantic import Field, NonNegativeInt
 
 from mapstream.operators.operator import OperatorConfig
-from mapstream.streams.arrays import FloatArray, IntArray
+from mapstream.streams.arrays import BoolArray, FloatArray, IntArray
 
 Descriptors = npt.NDArray[Any]
-BoolArray = npt.NDArray[np.bool_]
 
 
 class MatchRules(OperatorConfig):

@@ -7,9 +7,10 @@ from typing import ClassVar
 
 import cv2
 
-from mapstream.operators.features.gray import unlike, wrong_size
+from mapstream.operators.images.calibrated import fitted
 from mapstream.operators.operator import Operator, Placement, offload, report_loss, warn
 from mapstream.operators.tracking.klt_tracker import KltConfig, KltTracker
+from mapstream.operators.tracking.stereo import fitted_pair
 from mapstream.operators.tracking.turning import GyroTurns
 from mapstream.streams.channel import Receiver, Sender
 from mapstream.streams.messages.sensors import CameraFrame, ImuBatch
@@ -63,9 +64,9 @@ class Klt(Operator[Inputs, Outputs]):
             interval=turns.interval,
         ):
             turn = turns.turn(frame, batches)
-            reason = wrong_size(frame)
-            if reason is not None:
-                report_loss(reason)
+            fits = fitted(frame, "drop")
+            if isinstance(fits, str):
+                report_loss(fits)
                 outputs.features.advance(frame.stamp_ns)
                 outputs.right_features.advance(frame.stamp_ns)
                 continue
@@ -74,8 +75,8 @@ class Klt(Operator[Inputs, Outputs]):
                 continue
             if right is None:
                 warn(f"images of {frame.frame} without one of the right camera")
-            elif (reason := wrong_size(right) or unlike(frame, right)) is not None:
-                report_loss(reason)
+            elif isinstance(fits := fitted_pair(frame, right), str):
+                report_loss(fits)
             else:
                 await outputs.right_features.send(await offload(tracker.track_right, frame, right))
                 continue

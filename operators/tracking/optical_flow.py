@@ -6,14 +6,12 @@ from typing import Any
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 from pydantic import Field, NonNegativeInt, PositiveFloat, PositiveInt
 
 from mapstream.operators.features.gray import GrayImage
 from mapstream.operators.operator import OperatorConfig
-from mapstream.streams.arrays import Float32Array
+from mapstream.streams.arrays import BoolArray, Float32Array
 
-BoolArray = npt.NDArray[np.bool_]
 _NO_CONTRAST, _SAME_GAIN, _SAME_MEAN = 1.0, 0.02, 1.0  # in grey values, and as a share
 
 

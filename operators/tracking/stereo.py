@@ -5,19 +5,17 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 from pydantic import PositiveFloat
 
+from mapstream.operators.images.calibrated import fitted
 from mapstream.operators.operator import OperatorConfig
 from mapstream.operators.tracking.epipolar import off_arc
 from mapstream.operators.tracking.rays import rays
-from mapstream.streams.arrays import Float32Array
+from mapstream.streams.arrays import BoolArray, Float32Array
 from mapstream.streams.calibration import CameraCalibration
 from mapstream.streams.camera_models import project
 from mapstream.streams.geometry import SE3
 from mapstream.streams.messages.sensors import CameraFrame
-
-BoolArray = npt.NDArray[np.bool_]
 
 
 class StereoOptions(OperatorConfig):
@@ -60,3 +58,10 @@ class StereoPair:
         missed = off_arc(start, rays(self.right, right_px), goal[None], limit_rad)[0]
         agreeing: BoolArray = np.isfinite(missed)
         return agreeing
+
+
+def fitted_pair(left: CameraFrame, right: CameraFrame) -> CameraFrame | str:
+    """Return the right image of a pair, or why it has to go: it is not of its calibration's size, or the left one's."""
+    if left.image.shape[:2] == right.image.shape[:2]:
+        return fitted(right, "drop")
+    return f"images of {right.frame} that are not as large as those of {left.frame}"

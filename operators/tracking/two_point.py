@@ -7,14 +7,12 @@ The two rays of a point, turned into one frame, span a plane in which the transl
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 from pydantic import PositiveFloat, PositiveInt
 
 from mapstream.operators.operator import OperatorConfig, warn
 from mapstream.operators.tracking.epipolar import off_arc
-from mapstream.streams.arrays import FloatArray
+from mapstream.streams.arrays import BoolArray, FloatArray
 
-BoolArray = npt.NDArray[np.bool_]
 _MIN_TRACKS = 6  # with fewer, agreement means nothing
 
 

@@ -8,9 +8,9 @@ from __future__ import annotations
 import numpy as np
 from pydantic import NonNegativeFloat, PositiveFloat, PositiveInt
 
-from mapstream.operators.features.spread import BoolArray, Spread, apart, spread
+from mapstream.operators.features.spread import Spread, apart, spread
 from mapstream.operators.operator import OperatorConfig
-from mapstream.streams.arrays import Float32Array, IntArray
+from mapstream.streams.arrays import BoolArray, Float32Array, IntArray
 
 
 class TrackLimits(OperatorConfig):

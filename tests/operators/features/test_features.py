@@ -130,7 +130,7 @@ async def test_black_images_and_those_of_a_wrong_size_are_counted(kind: Detector
         "images of camera without a keypoint: too dark, or without texture": 1
     }
     (loss,) = activity.losses
-    assert "160 x 120 px, though it is calibrated for 320 x 240 px" in loss
+    assert "160 x 120 px, where the calibration is of 320 x 240 px" in loss
 
 
 _POINTS = st.lists(

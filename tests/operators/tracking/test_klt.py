@@ -270,7 +270,7 @@ async def test_images_of_another_size_or_without_a_partner_are_counted() -> None
     assert [f.stamp_ns for f in out["features"]] == [f.stamp_ns for f in frames if f is not small]
     assert [f.stamp_ns for f in out["right_features"]] == [rights[0].stamp_ns, rights[3].stamp_ns]
     assert sorted(activity.losses.values()) == [1, 1]
-    assert any("160 x 120 px, though it is calibrated" in text for text in activity.losses)
+    assert any("160 x 120 px, where the calibration is of" in text for text in activity.losses)
     assert any("right that are not as large as those of left" in text for text in activity.losses)
     assert activity.warnings["images of left without one of the right camera"] == 1
     # two cameras in one place are no pair: nothing checks what they match, and the user hears of it
