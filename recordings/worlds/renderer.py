@@ -191,9 +191,8 @@ class _Patch:
     level: int
     picture_by_px: FloatArray  # (3, 3) from the patch's pixels
     place: tuple[slice, slice]  # rows and columns of the image
-    across: (
-        Float32Array  # (L, 1, W) a x of lines a x + b y + c: 1 / z, and the edges, positive inside
-    )
+    # Of lines a x + b y + c: the first is 1 / z, the others are the edges, positive inside.
+    across: Float32Array  # (L, 1, W) a x
     along: Float32Array  # (L, H, 1) b y + c
 
     def part(self, image: A) -> A:
