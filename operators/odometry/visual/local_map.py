@@ -13,7 +13,7 @@ from mapstream.operators.odometry.visual.elimination import eliminate
 from mapstream.operators.odometry.visual.sightings import Grouped, Sightings, grouped
 from mapstream.operators.odometry.visual.triangulation import gains_at
 from mapstream.streams.arrays import FloatArray, IntArray
-from mapstream.streams.geometry import se3_exp
+from mapstream.streams.geometry import se3_exp, straightened
 
 _STEPS = 5
 _FAULT = 2.0  # times the expected sum of squares, from which on a point counts little (Cauchy)
@@ -93,7 +93,7 @@ class LocalMap:
             H = (found.H[:, :, 6 * fixed :] * root[..., None]).reshape(-1, 6 * (num - fixed))
             r = (found.residuals * root).ravel()
             step = np.linalg.solve(H.T @ H + 1e-6 * np.eye(H.shape[1]), H.T @ r).reshape(-1, 6)
-            self._poses[fixed:] = se3_exp(step) @ self._poses[fixed:]
+            self._poses[fixed:] = straightened(se3_exp(step) @ self._poses[fixed:])
             if np.linalg.norm(step) < _STILL:
                 break
         self._settle()

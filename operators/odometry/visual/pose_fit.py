@@ -15,7 +15,7 @@ from mapstream.operators.odometry.visual.sightings import BoolArray, Sightings, 
 from mapstream.operators.odometry.visual.triangulation import by_pose, gains_at
 from mapstream.streams.arrays import FloatArray
 from mapstream.streams.errors import EstimationError
-from mapstream.streams.geometry import invert, se3_exp
+from mapstream.streams.geometry import invert, se3_exp, straightened
 
 _STEPS = 10
 _FAULT = 2.0  # times the expected sum of squares, from which on a point counts little (Cauchy)
@@ -50,7 +50,7 @@ def fit_pose(
     for _ in range(_STEPS):
         squares, freedom, N, vector = _normal(sightings, positions, roots, T)
         step = np.linalg.solve(N, vector)
-        T = se3_exp(step) @ T
+        T = straightened(se3_exp(step) @ T)
         if np.linalg.norm(step) < 1e-7:
             break
     return PoseFit(T, np.asarray(np.linalg.inv(N)), squares < _INLIER * freedom)

@@ -87,7 +87,8 @@ class Sightings:
         of far ones many images would average to a distance that is certain and wrong.
         """
         order = np.argsort(self.keys, kind="stable")
-        again = np.append(False, self.keys[order][1:] == self.keys[order][:-1])
+        again = np.zeros(len(self), bool)
+        again[1:] = self.keys[order][1:] == self.keys[order][:-1]
         second, first = order[again], order[np.flatnonzero(again) - 1]
         parallax = np.linalg.norm(self.rays[second] - self.rays[first], axis=1)
         kept = np.ones(len(self), bool)

@@ -1,0 +1,162 @@
+"""Visual-inertial, stereo and RGB-D odometry on real recordings."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mapstream.graph.load import load_graph
+from mapstream.graph.plan import plan
+from mapstream.graph.run import run_graph
+from mapstream.recordings.datasets.catalogue import convert
+from mapstream.recordings.evaluation import ape, associate
+from mapstream.recordings.pose_pairs import PosePairs
+from mapstream.recordings.trajectory_files import read_kitti, read_tum
+from mapstream.streams.geometry import invert, rotation_from_quat_xyzw
+from mapstream.streams.trajectory import Trajectory
+from tests.data import shared
+
+pytestmark = pytest.mark.anyio
+
+TRACKS = """
+version: 1
+name: tracks
+operators:
+  sensors: {use: mcap, config: {path: RECORDING, topics: {features: /cam0/features, imu: /imu}}}
+  n_frames: {use: n_frames, in: {features: sensors.features}}
+  odometry:
+    use: visual_inertial_odometry
+    in: {n_frames: n_frames.n_frames, imu: sensors.imu}
+    config: {imu: {recording: RECORDING}}
+    run: inline
+  path: {use: trajectory_sink, in: {odometry: odometry.odometry}, config: {path: OUT}}
+"""
+PAIR = """
+version: 1
+name: pair
+operators:
+  sensors: {use: mcap, config: {path: RECORDING, topics: {left: /cam0/image, right: /cam1/image}}}
+  left: {use: image_decode, in: {images: sensors.left}}
+  right: {use: image_decode, in: {images: sensors.right}}
+  tracks: {use: klt, in: {frames: left.frames, right_frames: right.frames}, config: {max_tracks: 500}}
+  n_frames:
+    use: n_frames
+    in: {left: tracks.features, right: tracks.right_features}
+    config: {inputs: [left, right]}
+  odometry: {use: visual_odometry, in: {n_frames: n_frames.n_frames}, run: inline}
+  path: {use: trajectory_sink, in: {odometry: odometry.odometry}, config: {path: OUT}}
+"""
+DEPTH = """
+version: 1
+name: depth
+operators:
+  sensors: {use: mcap, config: {path: RECORDING, topics: {color: /color/image, depth: /depth/image}}}
+  color: {use: image_decode, in: {images: sensors.color}}
+  depth: {use: image_decode, in: {images: sensors.depth}, config: {mode: depth}}
+  registered: {use: depth_registration, in: {depth: depth.frames, frames: color.frames}}
+  tracks:
+    use: klt
+    in: {frames: color.frames}
+    config: {max_tracks: 500, min_distance_px: 10}
+  points: {use: keypoint_depth, in: {features: tracks.features, depth: registered.depth}}
+  n_frames: {use: n_frames, in: {features: points.features}}
+  odometry: {use: visual_odometry, in: {n_frames: n_frames.n_frames}, run: inline}
+  path: {use: trajectory_sink, in: {odometry: odometry.odometry}, config: {path: OUT}}
+"""
+STANDING = """
+version: 1
+name: standing
+operators:
+  sensors:
+    use: mcap
+    config: {path: RECORDING, topics: {left: /cam0/image, right: /cam1/image, imu: /imu}}
+  left: {use: image_decode, in: {images: sensors.left}}
+  right: {use: image_decode, in: {images: sensors.right}}
+  tracks:
+    use: klt
+    in: {frames: left.frames, right_frames: right.frames, imu: sensors.imu}
+  n_frames:
+    use: n_frames
+    in: {left: tracks.features, right: tracks.right_features}
+    config: {inputs: [left, right]}
+  odometry:
+    use: visual_inertial_odometry
+    in: {n_frames: n_frames.n_frames, imu: sensors.imu}
+    config: {imu: {recording: RECORDING}}
+    run: inline
+  path: {use: trajectory_sink, in: {odometry: odometry.odometry}, config: {path: OUT}}
+"""
+
+
+async def run(graph: str, recording: Path, folder: Path) -> Trajectory:
+    """Return what the graph wrote."""
+    file, out = folder / "graph.yaml", folder / "path.tum"
+    file.write_text(graph.replace("RECORDING", str(recording)).replace("OUT", str(out)))
+    report = await run_graph(plan(load_graph(file)))
+    assert report.exit_code == 0, report
+    return read_tum(out)
+
+
+def open_vins() -> Trajectory:
+    """Return another estimator's poses of EuRoC V1_01."""
+    file = shared("euroc_v101_stereo_imu") / "gt_V1_01_easy_openvins.csv"
+    rows = np.genfromtxt(file, delimiter=",")
+    stamps = np.genfromtxt(file, delimiter=",", usecols=[0], dtype=np.int64)
+    poses = np.tile(np.eye(4), (len(rows), 1, 1))
+    poses[:, :3, 3] = rows[:, 1:4]
+    poses[:, :3, :3] = rotation_from_quat_xyzw(rows[:, [5, 6, 7, 4]])
+    return Trajectory(stamps_ns=stamps, poses=poses)
+
+
+@pytest.mark.slow
+async def test_C9_euroc_v1_01_for_30_s(tmp_path: Path) -> None:
+    """Tracks of one camera, from the installed gtsam."""
+    reference = open_vins()
+    recording = convert("eqvio", tmp_path / "tracks.mcap").path
+
+    found = await run(TRACKS, recording, tmp_path)
+
+    assert len(found) == 601
+    errors = ape(associate(found, reference))
+    assert errors.translation.rmse < 0.05
+
+
+@pytest.mark.slow
+async def test_a_real_drone_that_stands_does_not_drift(tmp_path: Path) -> None:
+    recording = convert(f"euroc:{shared('euroc_v101_stereo_imu')}", tmp_path / "in.mcap").path
+
+    found = await run(STANDING, recording, tmp_path)
+
+    assert len(found) == 20
+    path = found.poses[:, :3, 3]
+    assert np.linalg.norm(path - path[0], axis=1).max() < 0.01
+
+
+@pytest.mark.slow
+async def test_a_real_street_in_stereo(tmp_path: Path) -> None:
+    folder = shared("kitti_stereo")
+    recording = convert(f"kitti:{folder}", tmp_path / "in.mcap").path
+    reference = read_kitti(folder / "poses.txt").poses[:25]
+
+    found = (await run(PAIR, recording, tmp_path)).poses
+
+    assert len(found) == 25
+    true, drifted = (invert(poses[0]) @ poses[-1] for poses in (reference, found))
+    length_m = np.linalg.norm(np.diff(reference[:, :3, 3], axis=0), axis=1).sum()
+    drift = np.linalg.norm(true[:3, 3] - drifted[:3, 3]) / length_m
+    assert drift < 0.01
+
+
+@pytest.mark.slow
+async def test_a_real_kitchen_in_colour_and_depth(tmp_path: Path) -> None:
+    folder = shared("redkitchen_rgbd")
+    recording = convert(f"7scenes:{folder}", tmp_path / "in.mcap").path
+    poses = [np.loadtxt(folder / f"frame-{k:06d}.pose.txt") for k in range(150)]
+
+    found = await run(DEPTH, recording, tmp_path)
+
+    assert len(found) == 150
+    pairs = PosePairs(stamps_ns=found.stamps_ns, estimate=found.poses, reference=np.array(poses))
+    assert ape(pairs).translation.rmse < 0.06
