@@ -11,7 +11,9 @@ from pydantic import NonNegativeFloat, PositiveFloat
 from mapstream.operators.operator import Operator, OperatorConfig, Placement, offload, warn
 from mapstream.operators.tracking.rays import rays
 from mapstream.streams.arrays import Float32Array, FloatArray
+from mapstream.streams.calibration import CameraCalibration
 from mapstream.streams.channel import Receiver, Sender
+from mapstream.streams.errors import OperatorError
 from mapstream.streams.messages.sensors import CameraFrame
 from mapstream.streams.messages.vision import ImageFeatures
 from mapstream.streams.sync import anchored, nearest
@@ -69,10 +71,19 @@ class KeypointDepth(Operator[Inputs, Outputs]):
             await outputs.features.send(await offload(self.with_depth, features, depth))
 
     def with_depth(self, features: ImageFeatures, depth: CameraFrame) -> ImageFeatures:
-        """Return the keypoints with points and their uncertainty."""
+        """Return the keypoints with points and their uncertainty.
+
+        Raises:
+            OperatorError: If the depth is of another camera.
+        """
         if features.camera is None:
             warn(f"keypoints of {features.frame} without a camera model get no depth")
             return features
+        if not _is_registered(depth, features.camera):
+            raise OperatorError(
+                f"depth of {depth.frame} is not registered to {features.frame}; put depth_registration"
+                " before keypoint_depth"
+            )
         z = self._depth_m(features.keypoints_px, depth)
         directions = rays(features.camera, features.keypoints_px)
         points = directions * (z / directions[:, 2])[:, None]
@@ -106,3 +117,10 @@ class KeypointDepth(Operator[Inputs, Outputs]):
         good = inside & (usable.mean(axis=1) > 0.5)
         good &= farthest_m - nearest_m < config.max_step * mean_m
         return np.where(good, mean_m, np.nan)
+
+
+def _is_registered(depth: CameraFrame, camera: CameraCalibration) -> bool:
+    """Return whether pixels of depth are pixels of a camera, as far as both say."""
+    other = camera if depth.camera is None else depth.camera
+    has_size = depth.image.shape[:2] == (camera.height_px, camera.width_px)
+    return has_size and np.allclose(other.camera_matrix, camera.camera_matrix)
