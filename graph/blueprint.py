@@ -49,14 +49,22 @@ def blueprint_of(plan: Plan, outputs: Sequence[Output]) -> rrb.Blueprint:
     bounds = rrb.VisualBounds2D(x_range=x_range, y_range=y_range)
     operators = rrb.GraphView(origin=GRAPH, name="Operators", visual_bounds=bounds)
     space = [output for output in outputs if output.sends(*_IN_SPACE)]
-    main = rrb.Vertical(map_view(space), operators, row_shares=[3, 1]) if space else operators
-    side = [_cameras(plan, outputs), _plots(outputs), _texts(outputs)]
-    shown = [rrb.Tabs(*views) if len(views) > 1 else views[0] for views in side if views]
+    cameras = _cameras(plan, outputs)
+    large = (
+        [map_view(space)] if space else cameras
+    )  # without a map the images are what there is to see
+    main = rrb.Vertical(_tabs(large), operators, row_shares=[3, 1]) if large else operators
+    side = [cameras if space else [], _plots(outputs), _texts(outputs)]
+    shown = [_tabs(views) for views in side if views]
     return rrb.Blueprint(
         rrb.Horizontal(main, rrb.Vertical(*shown), column_shares=[5, 2]),
         rrb.TimePanel(timeline="stamp", state="collapsed"),
         *CLOSED,
     )
+
+
+def _tabs(views: Sequence[rrb.View]) -> rrb.View | rrb.Tabs:
+    return rrb.Tabs(*views) if len(views) > 1 else views[0]
 
 
 def map_view(

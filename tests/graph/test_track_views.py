@@ -95,6 +95,7 @@ def test_P4_each_image_of_a_pair_shows_its_own_keypoints() -> None:
 
     views = list(_views(blueprint_of(plan, drawn_outputs(plan)).root_container))
 
+    assert [view.name for view in views][:3] == ["cameras/left", "cameras/right", "Operators"]
     contents = {view.name: view.contents for view in views if "cameras" in str(view.name)}
     assert contents == {
         "cameras/left": ["+ /cameras/left/**", "+ /klt/features/**"],
