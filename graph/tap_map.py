@@ -38,7 +38,7 @@ def view_map(
     Raises:
         MapError: If no viewer answers, or the one that did takes nothing.
     """
-    from mapstream.graph.map_blueprint import map_blueprint  # noqa: PLC0415  # imports rerun
+    from mapstream.graph.blueprint_map import map_blueprint  # noqa: PLC0415  # imports rerun
     from mapstream.graph.views import Scene, view_of  # noqa: PLC0415
     from mapstream.graph.views.maps import cloud_entry  # noqa: PLC0415
 
