@@ -36,7 +36,7 @@ from mapstream.streams.messages.sensors import (
     TransformBatch,
     WheelOdometry,
 )
-from mapstream.streams.messages.vision import ImageFeatures, NFrame
+from mapstream.streams.messages.vision import GlobalDescriptor, ImageFeatures, NFrame
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -168,4 +168,5 @@ def one_of_each(seed: int) -> list[Any]:
         ),
         features,
         NFrame(stamp_ns=stamp, features=(features,) * n),
+        GlobalDescriptor(stamp_ns=stamp, kind="vlad", frame="camera", vector=np.ones(4, np.float32)),
     ]  # fmt: skip
