@@ -117,6 +117,7 @@ def test_K4_one_camera_alone_has_no_scale_and_odometry_gives_one() -> None:
     assert position_errors_m(world, result).max() < 1e-3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("loss", ["huber", "cauchy"])
 def test_K7_gross_outliers_hardly_matter(loss: Loss) -> None:
     """A fifth of all keypoints anywhere within 40 px: the error is below 1.5 of that without them."""

@@ -50,6 +50,7 @@ def test_K11_a_misplaced_camera_is_found() -> None:
     assert (found["right"].T_base_sensor.matrix == right.T_base_sensor.matrix).all()
 
 
+@pytest.mark.slow
 def test_U18_the_report_says_what_changed_and_what_that_explains() -> None:
     """Keypoints fit to their noise after, and not before; the error is within three standard deviations."""
     world = World(noise_px=0.3)
@@ -66,6 +67,7 @@ def test_U18_the_report_says_what_changed_and_what_that_explains() -> None:
     assert len(list(report.lines())) == 2
 
 
+@pytest.mark.slow
 def test_U18_what_the_motion_does_not_show_is_refused() -> None:
     """A rig that rolls and pitches little does not show how high above the base it sits."""
     world = World(noise_px=0.3)
@@ -77,6 +79,7 @@ def test_U18_what_the_motion_does_not_show_is_refused() -> None:
     assert "no camera has seen a landmark" in next(report.lines())
 
 
+@pytest.mark.slow
 def test_K11_F11_a_lens_is_found_and_stays_if_it_is_fixed() -> None:
     """1 % of focal length and 3 px of the centre; held, it keeps its bits while the place of the camera moves."""
     lens = replace(PINHOLE, distortion="radtan", distortion_parameters=np.array([-0.1, 0.02, 0, 0]))
@@ -105,6 +108,7 @@ def test_K11_F11_a_lens_is_found_and_stays_if_it_is_fixed() -> None:
     assert (kept.T_base_sensor.matrix != camera.T_base_sensor.matrix).any()
 
 
+@pytest.mark.slow
 def test_F11_halves_of_a_cameras_place_stay() -> None:
     """Bit for bit, while the other half moves."""
     world = World(noise_px=0.3, num_points=60)
@@ -147,6 +151,7 @@ def test_K12_a_late_clock_is_found() -> None:
     assert np.abs(offset_ms - 20).max() < 1
 
 
+@pytest.mark.slow
 def test_A22_poses_are_better_if_rows_have_times_of_their_own() -> None:
     """20 ms from the first row to the last."""
     rolling = replace(PINHOLE, line_delay_ns=41_667)
