@@ -15,7 +15,7 @@ from mapstream.streams.arrays import Float32Array, IntArray
 from mapstream.streams.messages.vision import NO_TRACK, ImageFeatures, NFrame
 
 _TAIL = 12  # images that a tail reaches back
-_LONG = 30  # images after which a track has the last colour of the ramp
+_SHORT, _LONG = -3, 30  # images at the ends of the colours; the ramp begins too dark to be seen
 _SAME_MOMENT_NS = 1_000_000
 _MATCH = 0xFFFFFF50
 _ABOVE = 10.0  # the image, in draw order
@@ -53,7 +53,7 @@ def view_image_features(features: ImageFeatures, scene: Scene) -> Drawing:
     trails: Trails = scene.remember(f"trails {features.frame} {features.kind}", Trails())
     ended = trails.follow(ids, px)
     lengths = np.array([trails.length[track] for track in ids.tolist()], np.float64)
-    colors: Any = ramp_colors(lengths, 1, _LONG)
+    colors: Any = ramp_colors(lengths, _SHORT, _LONG)
     strips = [np.array(trails.tails[track], np.float32) for track in ids.tolist()]
     matches = _matches(features, ids, px, scene)
     return [

@@ -48,7 +48,7 @@ def test_P4_tracks_have_tails_in_the_colour_of_their_length(tmp_path: Path) -> N
     assert [len(strip) for strip in tails[-1]] == [12, 12, 1]
     np.testing.assert_allclose(np.array(tails[-1][0])[:, 0], 10 + 2 * np.arange(8, 20))
     colors = values_of(entities["/op/port/tracks"], "Points2D:colors")
-    assert colors[-1] == ramp_colors(np.array([20.0, 20.0, 1.0]), 1, 30).tolist()
+    assert colors[-1] == ramp_colors(np.array([20.0, 20.0, 1.0]), -3, 30).tolist()
     ended = values_of(entities["/op/port/ended"], "Points2D:positions")
     assert [len(points) for points in ended] == [0] * 15 + [1] * 5
     assert ended[15] == [[90 + 2 * 14, 30]]
