@@ -26,6 +26,7 @@ BUILT_IN = {
     "absolute_poses": "mapstream.operators.absolute.poses:AbsolutePoses",
     "clahe": "mapstream.operators.images.clahe:Clahe",
     "cloud_sink": "mapstream.operators.sinks.cloud:CloudSink",
+    "compress_descriptors": "mapstream.operators.features.compress_descriptors:CompressDescriptors",
     "depth_registration": "mapstream.operators.images.depth_registration:DepthRegistration",
     "eight_bits": "mapstream.operators.images.eight_bits:EightBits",
     "external_features": "mapstream.operators.features.external_features:ExternalFeatures",

@@ -20,12 +20,12 @@ from mapstream.recordings.maps.ids import as_keys
 from mapstream.recordings.maps.model import TABLES, Map, from_tables
 from mapstream.recordings.maps.order import in_canonical_order
 from mapstream.recordings.maps.rows import concatenate, shifted, table_digest
-from mapstream.recordings.maps.tables import Frames, Journal
+from mapstream.recordings.maps.tables import Frames, Journal, Projections
 from mapstream.streams.arrays import IntArray
 from mapstream.streams.errors import MapError
 from mapstream.streams.geometry import invert
 
-_WITH_IDS = ("missions", "frames", "vertices", "landmarks", "edges", "resources")
+_WITH_IDS = ("missions", "frames", "vertices", "landmarks", "edges", "resources", "projections")
 _PARTS = (
     ("imu", "edge"),
     ("feature_sets", "vertex"),
@@ -136,7 +136,13 @@ def _content(map_: Map, mission_id: str) -> dict[str, bytes]:
         T_map_mission=np.eye(4)[None],
         is_base_frame_known=np.array([False]),
     )
-    alone = replace(alone, missions=missions, frames=Frames(), journal=Journal())
+    alone = replace(
+        alone,
+        missions=missions,
+        frames=Frames(),
+        projections=Projections(),
+        journal=Journal(),
+    )
     return {name: table_digest(table) for name, table in alone.tables().items()}
 
 

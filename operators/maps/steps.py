@@ -25,6 +25,7 @@ TOOLS = {
     "anchor_missions": "mapstream.operators.places.anchoring:anchor_missions",
     "calibrate": "mapstream.operators.estimation.vision.calibration:calibrate",
     "close_visual_loops": "mapstream.operators.places.loops:find_visual_loops",
+    "compress_descriptors": "mapstream.operators.maps.descriptor_projections:compress_descriptors",
     "create_landmarks": "mapstream.operators.landmarks.create:create_landmarks",
     "evaluate_quality": "mapstream.operators.landmarks.quality:evaluate_quality",
     "fix_stationary": "mapstream.operators.maps.stationary:fix_stationary",
@@ -36,6 +37,7 @@ TOOLS = {
     "retriangulate": "mapstream.operators.landmarks.create:retriangulate",
     "summarize": "mapstream.operators.places.summary:summarize",
     "sparsify": "mapstream.operators.maps.sparsify:sparsify",
+    "train_projection": "mapstream.operators.maps.descriptor_projections:train_projection",
 }
 """By the name that graph files use; what is imported is imported when a graph uses it."""
 

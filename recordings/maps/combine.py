@@ -46,6 +46,8 @@ def merge_maps(maps: Sequence[Map], *, share_frame: bool = False) -> Map:
         merged = from_tables(
             {name: concatenate([old, shifted(new, num_rows)]) for name, old, new in pairs}
         )
+    first = np.unique(as_keys(merged.projections.id), return_index=True)[1]
+    merged = merged.select(projections=np.isin(np.arange(len(merged.projections)), first))
     return _with_each_frame_once(merged)
 
 

@@ -26,6 +26,7 @@ from mapstream.recordings.maps.tables import (
     Landmarks,
     Missions,
     Observations,
+    Projections,
     Resources,
     Vertices,
 )
@@ -48,6 +49,7 @@ class Map:
     feature_sets: FeatureSets = field(default_factory=FeatureSets)
     observations: Observations = field(default_factory=Observations)
     resources: Resources = field(default_factory=Resources)
+    projections: Projections = field(default_factory=Projections)
     journal: Journal = field(default_factory=Journal)
 
     @classmethod

@@ -269,6 +269,21 @@ class Resources(Table):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Projections(Table):
+    meaning: ClassVar[str] = "Linear maps of descriptors that were learnt from a map."
+
+    id: IdArray = column("uint8", "from all that it says", (16,))
+    kind: TextArray = column("text", "of the features")
+    use: TextArray = column(
+        "text", "compression: descriptors of the kind are its results; index: of a multi-index"
+    )
+    num_inputs: IntArray = column("int64", "numbers, or bits, of a descriptor")
+    num_outputs: IntArray = column("int64", "numbers of its projection")
+    mean: BytesArray = column("bytes", "float32 that are taken off first, little-endian")
+    matrix: BytesArray = column("bytes", "float32, a row per input, little-endian")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Journal(Table):
     meaning: ClassVar[str] = (
         "What was done to the map, in order; without times, so that runs compare."

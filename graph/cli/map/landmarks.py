@@ -41,6 +41,8 @@ VERBS = (
     Verb("close-visual-loops", "lc", "Find places that cameras saw again: edges, or landmarks merged."),
     Verb("anchor-missions", "aam", "Find where missions lie by what they see of anchored ones."),
     Verb("calibrate", "", "Find places, lenses or clocks of cameras, and tell how sure that is."),
+    Verb("compress-descriptors", "", "Keep fewer numbers of each descriptor of a kind, by principal components."),
+    Verb("train-projection", "train_projection_matrix", "Learn how an index projects descriptors of a kind."),
 )  # fmt: skip
 
 
