@@ -85,65 +85,54 @@ class Fiducials(Operator[Inputs, Outputs]):
         self._outer = OuterFrame(name=config.frame) if config.frame else None
 
     async def run(self, inputs: Inputs, outputs: Outputs) -> None:
-        async def send(found: tuple[CameraFrame, list[Constraint], list[str]]) -> None:
-            frame, constraints, remarks = found
-            for remark in remarks:
-                warn(remark)
+        async def send(found: tuple[int, list[Constraint]]) -> None:
+            stamp_ns, constraints = found
             for constraint in constraints:
                 await outputs.constraints.send(constraint)
             if not constraints:
-                outputs.constraints.advance(frame.stamp_ns)
+                outputs.constraints.advance(stamp_ns)
 
         await pipeline(self._measured, inputs.frames, send)
 
-    def _measured(self, frame: CameraFrame) -> tuple[CameraFrame, list[Constraint], list[str]]:
-        constraints, remarks = self.measure(frame)
-        return frame, constraints, remarks
+    def _measured(self, frame: CameraFrame) -> tuple[int, list[Constraint]]:
+        return frame.stamp_ns, self.measure(frame)
 
-    def measure(self, frame: CameraFrame) -> tuple[list[Constraint], list[str]]:
-        """Return the measurements of one image, and why what was seen is none.
+    def measure(self, frame: CameraFrame) -> list[Constraint]:
+        """Return the measurements of one image; what was seen and is none is counted by its reason.
 
         Raises:
             OperatorError: If the camera has no calibration.
         """
-        remarks: list[str] = []
-        seen = list(self._usable(frame, remarks))
+        camera = require_camera(frame)
+        seen = list(self._usable(frame, camera))
         known = [marker for marker in seen if marker.number in self._tags.places]
         found = [
-            self._absolute(frame, known, remarks) if known else None,
-            *(self._landmark(frame, marker, remarks) for marker in seen if marker not in known),
+            self._absolute(frame, camera, known) if known else None,
+            *(self._landmark(frame, camera, marker) for marker in seen if marker not in known),
         ]
-        return [constraint for constraint in found if constraint is not None], remarks
+        return [constraint for constraint in found if constraint is not None]
 
-    def _usable(self, frame: CameraFrame, remarks: list[str]) -> Iterator[Marker]:
-        for marker in detect_markers(gray(frame), require_camera(frame), self._config.family):
+    def _usable(self, frame: CameraFrame, camera: CameraCalibration) -> Iterator[Marker]:
+        for marker in detect_markers(gray(frame), camera, self._config.family):
             if self._tags.size_of(marker.number) is None:
-                remarks.append(f"marker {marker.number} in {frame.frame}, whose size nobody said")
+                warn(f"marker {marker.number} in {frame.frame}, whose size nobody said")
             elif marker.side_px < self._config.least_side_px:
-                remarks.append(f"markers in {frame.frame} too small to measure by")
+                warn(f"markers in {frame.frame} too small to measure by")
             else:
                 yield marker
 
     def _absolute(
-        self, frame: CameraFrame, known: list[Marker], remarks: list[str]
+        self, frame: CameraFrame, camera: CameraCalibration, known: list[Marker]
     ) -> Constraint | None:
-        """Return where the camera was, from all corners of known place; the best marker alone gives the start."""
-        camera = require_camera(frame)
+        """Return where the camera was, from all corners of known place; each marker alone gives starts."""
         starts = [
-            (pose.rms_px, pose.T_camera_points @ self._tags.places[marker.number].inverse())
+            pose.T_camera_points @ self._tags.places[marker.number].inverse()
             for marker in known
             for pose in self._poses(camera, marker)
         ]
-        if not starts:
-            remarks.append(f"markers in {frame.frame} that are no squares")
-            return None
         points = np.concatenate([self._tags.corners_in_frame(m.number) for m in known])
         px = np.concatenate([marker.corners_px for marker in known])
-        poses = sorted(
-            (points_pose(camera, points, px, start) for _, start in starts),
-            key=lambda pose: pose.rms_px,
-        )
-        best = self._sure(frame, poses, remarks)
+        best = self._sure(frame, [points_pose(camera, points, px, start) for start in starts])
         if best is None:
             return None
         T_camera_frame = best.T_camera_points
@@ -160,11 +149,10 @@ class Fiducials(Operator[Inputs, Outputs]):
         )
 
     def _landmark(
-        self, frame: CameraFrame, marker: Marker, remarks: list[str]
+        self, frame: CameraFrame, camera: CameraCalibration, marker: Marker
     ) -> Constraint | None:
         """Return where a marker was, from the base."""
-        poses = self._poses(require_camera(frame), marker)
-        best = self._sure(frame, poses, remarks) if poses else None
+        best = self._sure(frame, self._poses(camera, marker))
         if best is None:
             return None
         name = f"{self._config.family}:{marker.number}"
@@ -181,20 +169,16 @@ class Fiducials(Operator[Inputs, Outputs]):
     def _poses(self, camera: CameraCalibration, marker: Marker) -> list[PointsPose]:
         return square_poses(camera, self._tags.corners_of(marker.number), marker.corners_px)
 
-    def _sure(
-        self, frame: CameraFrame, poses: list[PointsPose], remarks: list[str]
-    ) -> PointsPose | None:
+    def _sure(self, frame: CameraFrame, poses: list[PointsPose]) -> PointsPose | None:
         """Return the best pose, if it fits and no other one does."""
-        config, best = self._config, poses[0]
-        if best.rms_px > config.most_error_px:
-            remarks.append(
-                f"markers in {frame.frame} that do not fit their size, place or calibration"
-            )
+        config = self._config
+        best = min(poses, key=lambda pose: pose.rms_px, default=None)
+        if best is None or best.rms_px > config.most_error_px:
+            warn(f"markers in {frame.frame} that do not fit their size, place or calibration")
             return None
         limit_px = config.least_ambiguity * max(best.rms_px, config.sigma_px)
-        others = [pose for pose in poses[1:] if _is_other(best, pose)]
-        if any(pose.rms_px < limit_px for pose in others):
-            remarks.append(f"markers in {frame.frame} that may be seen in two ways")
+        if any(_is_other(best, pose) and pose.rms_px < limit_px for pose in poses):
+            warn(f"markers in {frame.frame} that may be seen in two ways")
             return None
         return best
 

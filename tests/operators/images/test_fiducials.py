@@ -136,8 +136,8 @@ async def test_A13_all_known_markers_of_an_image_are_one_measurement() -> None:
     both = Fiducials(FiducialsConfig(size_m=_SIZE_M, tags=_known(3, 8)))
     one = Fiducials(FiducialsConfig(size_m=_SIZE_M, tags=_known(8)))
 
-    (joint,), _ = both.measure(picture)
-    alone, _ = one.measure(picture)
+    (joint,) = both.measure(picture)
+    alone = one.measure(picture)
     assert {c.kind for c in alone} == {"absolute", "landmark"}
     (absolute,) = (c for c in alone if c.kind == "absolute")
     assert np.linalg.det(joint.covariance) < 0.1 * np.linalg.det(absolute.covariance)
