@@ -32,6 +32,7 @@ VERBS = {  # verb -> function or group of commands, and what a list of verbs say
     "batch": ("batch:batch", "Run map commands from a file, one after another."),
     "eval": ("evaluate:evaluate", "Compare a trajectory or map with a reference."),
     "models": ("models:app", "List and install trained networks."),
+    "localize": ("localize:localize", "Find a robot in a map that was made before."),
     "check-plugin": ("plugins:check_plugin", "Check the operators of another package."),
 }
 

@@ -19,6 +19,7 @@ from mapstream.operators.places.views import VertexViews
 from mapstream.recordings.maps.build import anchored
 from mapstream.recordings.maps.columns import BoolArray
 from mapstream.recordings.maps.model import Map
+from mapstream.recordings.maps.projections import projections_of
 from mapstream.streams.arrays import FloatArray
 from mapstream.streams.geometry import SE3, invert, se3_exp, se3_log, so3_log
 
@@ -142,7 +143,7 @@ def _places_of_mission(map_: Map, vertices: list[int], config: AnchoringConfig) 
 
 def known_places(map_: Map, config: RecognitionConfig, views: VertexViews) -> PlaceDatabase:
     """Return a database of what missions with known places see."""
-    database = PlaceDatabase(config.look)
+    database = PlaceDatabase(config.look, projections_of(map_, "index"))
     for vertex in np.flatnonzero(map_.missions.is_base_frame_known[map_.vertices.mission]).tolist():
         database.add(map_, vertex, views.at(vertex))
     return database

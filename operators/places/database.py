@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
 
 import numpy as np
@@ -19,6 +19,7 @@ from mapstream.operators.places.indices.index import (
 from mapstream.operators.places.views import View
 from mapstream.recordings.maps.columns import BoolArray
 from mapstream.recordings.maps.model import Map
+from mapstream.recordings.maps.projections import DescriptorProjection
 from mapstream.streams.arrays import Float32Array, FloatArray, IntArray
 
 
@@ -73,11 +74,11 @@ class PlaceDatabase:
 
     Args:
         config: Of the indices, and when descriptors look alike.
-        projections: By kind, of the multi-index; learnt from the descriptors without.
+        projections: By kind, of the multi-index, as `projections_of` reads them; learnt from the descriptors without.
     """
 
     def __init__(
-        self, config: LookConfig, projections: dict[str, npt.NDArray[np.float32]] | None = None
+        self, config: LookConfig, projections: Mapping[str, DescriptorProjection] | None = None
     ) -> None:
         self._config = config
         self._projections = projections or {}

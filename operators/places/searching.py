@@ -7,7 +7,6 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 from pydantic import NonNegativeFloat, PositiveInt
 
 from mapstream.operators.places.database import PlaceDatabase
@@ -19,10 +18,8 @@ from mapstream.operators.places.recognition import (
 )
 from mapstream.operators.places.views import VertexViews
 from mapstream.recordings.maps.model import Map
+from mapstream.recordings.maps.projections import DescriptorProjection, projections_of
 from mapstream.streams.arrays import FloatArray
-
-Projections = Mapping[str, npt.NDArray[np.float32]]
-"""By kind of feature: matrices that project its bits to a few numbers."""
 
 
 class SearchConfig(RecognitionConfig):
@@ -53,7 +50,9 @@ class Search:
     descriptors are never those of the moment before.
     """
 
-    def __init__(self, config: SearchConfig, projections: Projections | None = None) -> None:
+    def __init__(
+        self, config: SearchConfig, projections: Mapping[str, DescriptorProjection] | None = None
+    ) -> None:
         self._config, self._projections = config, dict(projections or {})
         self._databases: dict[int, PlaceDatabase] = {}  # by mission, or one of all
         self._waiting: dict[int, deque[int]] = {}  # by mission: vertices that are not put there yet
@@ -86,13 +85,11 @@ class Search:
         return self._databases[key]
 
 
-def search(
-    map_: Map, config: SearchConfig, projections: Projections | None = None
-) -> Iterator[Compared]:
+def search(map_: Map, config: SearchConfig) -> Iterator[Compared]:
     """Yield what comes of comparing the vertices of a map with the past, mission by mission."""
     landmarks_map = landmark_positions(map_)
     views = VertexViews(map_, config.kinds)
-    searching = Search(config, projections)
+    searching = Search(config, projections_of(map_, "index"))
     for mission in range(len(map_.missions)):
         for vertex in map_.vertices_of(mission)[:: config.every].tolist():
             compared = searching.compare(map_, vertex, views, landmarks_map)

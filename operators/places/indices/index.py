@@ -15,6 +15,7 @@ import numpy.typing as npt
 from pydantic import Field, NonNegativeInt, PositiveInt
 
 from mapstream.operators.operator import OperatorConfig
+from mapstream.recordings.maps.projections import DescriptorProjection
 from mapstream.streams.arrays import Float32Array, IntArray
 from mapstream.streams.errors import MapError
 
@@ -84,7 +85,10 @@ _MORE_FROM = {10_000: 1, 100_000: 1, 1_000_000: 3, 10_000_000: 2}  # 1, 2, 3, 6,
 
 
 def make_index(
-    width: int, dtype: npt.DTypeLike, config: IndexConfig, projection: Descriptors | None = None
+    width: int,
+    dtype: npt.DTypeLike,
+    config: IndexConfig,
+    projection: DescriptorProjection | None = None,
 ) -> DescriptorIndex:
     """Return an empty index for descriptors of one width and type.
 
@@ -92,10 +96,10 @@ def make_index(
         width: Numbers in a descriptor; of bits, their bytes.
         dtype: uint8 for bits, float32 for numbers.
         config: Which index, and its options.
-        projection: Of the multi-index, (bits, dimensions); without one it is learnt from what is added.
+        projection: Of the multi-index; without one it is learnt from what is added.
 
     Raises:
-        MapError: If descriptors are neither bits nor float32.
+        MapError: If descriptors are neither bits nor float32, or the projection is for others.
     """
     from mapstream.operators.places.indices.faiss_indices import Exact, Hnsw  # noqa: PLC0415
     from mapstream.operators.places.indices.flann import Flann  # noqa: PLC0415

@@ -15,6 +15,8 @@ import numpy.typing as npt
 from mapstream.operators.places.indices.faiss_indices import Cells, Exact
 from mapstream.operators.places.indices.index import Descriptors, IndexConfig, Neighbours
 from mapstream.operators.places.indices.projection import Projection, learn_projection
+from mapstream.recordings.maps.projections import DescriptorProjection
+from mapstream.streams.errors import MapError
 
 _PER_CELL = 200  # descriptors
 _SAMPLE = 50_000  # descriptors from which the cells are learnt
@@ -26,11 +28,16 @@ class MultiIndex:
     """Exact while it is small; beyond, cells are learnt from what is in it, and again as it grows."""
 
     def __init__(
-        self, width: int, config: IndexConfig, projection: npt.NDArray[Any] | None = None
+        self, width: int, config: IndexConfig, projection: DescriptorProjection | None = None
     ) -> None:
         self._width, self._config = width, config
         self._all = Exact(width, "uint8")
-        self._given = None if projection is None else Projection.from_matrix(projection, width)
+        if projection is not None and len(projection.mean) != 8 * width:
+            found, kind = len(projection.mean), projection.kind
+            raise MapError(
+                f"the index of {kind} projects {found} bits, and descriptors have {8 * width}"
+            )
+        self._given = None if projection is None else Projection.learnt(projection)
         self._projection: Projection | None = None
         self._cells: Cells | None = None
         self._num_learnt = 0

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from mapstream.operators.places.indices.index import Descriptors
+from mapstream.recordings.maps.projections import DescriptorProjection
 from mapstream.streams.arrays import Float32Array, FloatArray
-from mapstream.streams.errors import MapError
 
 _ITERATIONS = 30
 
@@ -23,17 +21,9 @@ class Projection:
     offset: Float32Array  # (dimensions,)
 
     @classmethod
-    def from_matrix(cls, matrix: npt.NDArray[Any], width: int) -> Projection:
-        """Return the projection by a matrix (bits, dimensions) for descriptors of `width` bytes.
-
-        Raises:
-            MapError: If the matrix is for other descriptors.
-        """
-        if matrix.ndim != 2 or len(matrix) != 8 * width:
-            expected, found = f"({8 * width}, dimensions)", matrix.shape
-            raise MapError(f"a projection of {width} bytes has shape {expected}, not {found}")
-        weights = matrix.astype(np.float32)
-        return cls(weights, np.zeros(weights.shape[1], np.float32))
+    def learnt(cls, projection: DescriptorProjection) -> Projection:
+        """Return the projection that a map keeps."""
+        return cls(projection.matrix, projection.mean @ projection.matrix)
 
     def __call__(self, descriptors: Descriptors) -> Float32Array:
         """Return the projections (N, dimensions) of descriptors (N, bytes)."""

@@ -13,6 +13,7 @@ from mapstream.operators.places.indices.index import (
     make_index,
     save_index,
 )
+from mapstream.recordings.maps.projections import DescriptorProjection
 from mapstream.streams.errors import MapError
 from tests.operators.places import descriptors as made
 
@@ -85,8 +86,9 @@ def test_an_index_with_fewer_descriptors_than_asked_for_says_so(kind: str) -> No
 
 def test_the_multi_index_takes_a_given_projection() -> None:
     stored, queries = _descriptors("multi_index", 3000)
-    matrix = np.random.default_rng(0).standard_normal((512, 10))
-    index = make_index(64, "uint8", _SMALL, matrix)
+    matrix = np.random.default_rng(0).standard_normal((512, 10)).astype(np.float32)
+    projection = DescriptorProjection("brisk", "index", np.full(512, 0.5, np.float32), matrix)
+    index = make_index(64, "uint8", _SMALL, projection)
     index.add(stored)
 
     found = index.search(queries, 1)
@@ -95,8 +97,12 @@ def test_the_multi_index_takes_a_given_projection() -> None:
 
 
 def test_a_projection_of_other_descriptors_is_refused() -> None:
-    with pytest.raises(MapError, match=r"\(512, dimensions\), not \(256, 10\)"):
-        make_index(64, "uint8", _SMALL, np.zeros((256, 10)))
+    other = DescriptorProjection(
+        "orb", "index", np.zeros(256, np.float32), np.zeros((256, 10), np.float32)
+    )
+
+    with pytest.raises(MapError, match="of orb projects 256 bits, and descriptors have 512"):
+        make_index(64, "uint8", _SMALL, other)
 
 
 def test_descriptors_of_another_type_are_refused() -> None:
