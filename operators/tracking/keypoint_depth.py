@@ -8,6 +8,7 @@ from typing import ClassVar
 import numpy as np
 from pydantic import NonNegativeFloat, PositiveFloat
 
+from mapstream.operators.images.depth import depth_m_of
 from mapstream.operators.operator import Operator, OperatorConfig, Placement, offload, warn
 from mapstream.operators.tracking.rays import rays
 from mapstream.streams.arrays import Float32Array, FloatArray
@@ -18,7 +19,6 @@ from mapstream.streams.messages.sensors import CameraFrame
 from mapstream.streams.messages.vision import ImageFeatures
 from mapstream.streams.sync import anchored, nearest
 
-_SCALES = {"16UC1": 1e-3, "mono16": 1e-3, "32FC1": 1.0}  # to metres
 _REACH_PX = 1  # around a keypoint, where depth must be smooth
 
 
@@ -95,21 +95,22 @@ class KeypointDepth(Operator[Inputs, Outputs]):
         )
 
     def _depth_m(self, px: Float32Array, depth: CameraFrame) -> FloatArray:
-        """Return the depth (N,) at pixels; NaN where there is none that can be trusted."""
+        """Return the depth (N,) at pixels; NaN where there is none that can be trusted.
+
+        Raises:
+            OperatorError: If it is no depth image.
+        """
         config = self._config
-        scale = _SCALES.get(depth.encoding)
-        if scale is None:
-            warn(f"depth in {depth.encoding}, which is none of {', '.join(_SCALES)}")
-            return np.full(len(px), np.nan)
-        height, width = depth.image.shape[:2]
+        depth_m = depth_m_of(depth, least_m=config.min_depth_m, most_m=config.max_depth_m)
+        height, width = depth_m.shape
         steps = np.arange(-_REACH_PX, _REACH_PX + 1)
         column, row = np.round(px).astype(np.int64).T
         inside = (column >= _REACH_PX) & (column < width - _REACH_PX)
         inside &= (row >= _REACH_PX) & (row < height - _REACH_PX)
         columns = np.clip(column, _REACH_PX, width - 1 - _REACH_PX)[:, None, None] + steps
         rows = np.clip(row, _REACH_PX, height - 1 - _REACH_PX)[:, None, None] + steps[:, None]
-        around = depth.image[rows, columns].astype(np.float64).reshape(len(px), -1) * scale
-        usable = (around > config.min_depth_m) & (around < config.max_depth_m)
+        around = depth_m[rows, columns].astype(np.float64).reshape(len(px), -1)
+        usable = np.isfinite(around)
         nearest_m = np.where(usable, around, np.inf).min(axis=1, initial=np.inf)
         farthest_m = np.where(usable, around, 0).max(axis=1, initial=0)
         counts = np.maximum(usable.sum(axis=1), 1)

@@ -60,10 +60,6 @@ class LocalMap:
             self._numbers, self._poses = self._numbers[1:], self._poses[1:]
         self._refine()
 
-    def clear(self) -> None:
-        """Forget all: what was seen before a loss cannot be joined to what is seen after it."""
-        self.__init__(self._most)  # type: ignore[misc]  # the state of a new one
-
     def found(self, keys: IntArray) -> IntArray:
         """Return the rows (N,) of the points with these keys; -1: none."""
         if len(self.keys) == 0:

@@ -51,17 +51,17 @@ class DescriptorTracks:
         """Take the keypoints of a keyframe, numbered, for what later ones are compared with."""
         place = (features.kind, features.frame)
         known = self._known.get(place)
-        assert_ids = features.track_ids
-        if assert_ids is None:
+        ids = features.track_ids
+        if ids is None:
             return
         if known is None:
             self._known[place] = _Known(
-                assert_ids, features.descriptors, np.zeros(len(features), np.int64)
+                ids, features.descriptors, np.zeros(len(features), np.int64)
             )
             return
-        kept = ~np.isin(known.ids, assert_ids) & (known.ages + 1 < self._memory)
+        kept = ~np.isin(known.ids, ids) & (known.ages + 1 < self._memory)
         self._known[place] = _Known(
-            np.concatenate([known.ids[kept], assert_ids]),
+            np.concatenate([known.ids[kept], ids]),
             np.concatenate([known.descriptors[kept], features.descriptors]),
             np.concatenate([known.ages[kept] + 1, np.zeros(len(features), np.int64)]),
         )

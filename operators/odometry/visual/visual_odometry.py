@@ -173,7 +173,7 @@ class VisualOdometry(Operator[Inputs, Outputs]):
         self._num_lost += 1
         self._T = straightened(self._T @ self._step)
         if self._num_lost >= self._config.max_lost:
-            self._map.clear()
+            self._map = LocalMap(self._config.num_keyframes)  # what is seen now has no tie to it
             self._step, self._num_lost = np.eye(4), 0
             self._keep(sightings)
         return self._odometry(stamp_ns, unmeasured(duration_s), is_lost=True)

@@ -17,18 +17,17 @@ from mapstream.operators.imu.samples import level_attitude
 from mapstream.operators.odometry.visual.elimination import eliminate
 from mapstream.operators.odometry.visual.sightings import (
     BoolArray,
-    Grouped,
     Sightings,
     grouped,
 )
 from mapstream.operators.odometry.visual_inertial.epipolar_bias import epipolar_bias
 from mapstream.operators.odometry.visual_inertial.integration import Integrated, Integration
+from mapstream.operators.odometry.visual_inertial.linear_start import MotionStart, linear_start
 from mapstream.operators.odometry.visual_inertial.state import NUM_INERTIAL, FilterState
 from mapstream.streams.arrays import FloatArray
 from mapstream.streams.geometry import hat, so3_log
 
 _LEAST_POINTS, _LEAST_VIEWS, _MOST_POINTS = 10, 4, 80
-_WIDE = 1e4  # [rad^2, m^2] of poses that nothing is known of
 _BIAS_STEP = 1e-4  # of numerical derivatives
 _LEAST_AGREED = 0.6  # of the points
 _FAULT = 4.0  # times the expected sum of squares, from which on a track counts little (Cauchy)
@@ -39,34 +38,10 @@ _STEPS = 15
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Start:
-    """What is looked for, in the axes of the IMU at the first image."""
-
-    gyro_bias: FloatArray  # (3,)
-    accel_bias: FloatArray  # (3,)
-    velocity: FloatArray  # (3,) [m/s]
-    down: FloatArray  # (3,) unit
-
-    @property
-    def sides(self) -> FloatArray:
-        """Return two directions (3, 2) in which `down` can move."""
-        return np.asarray(np.linalg.svd(self.down[None])[2][1:].T)
-
-    def moved(self, step: FloatArray) -> _Start:
-        down = self.down + self.sides @ step[9:]
-        return _Start(
-            self.gyro_bias + step[:3],
-            self.accel_bias + step[3:6],
-            self.velocity + step[6:9],
-            down / np.linalg.norm(down),
-        )
-
-
-@dataclass(frozen=True, slots=True, eq=False)
 class _Fit:
     """A start, and how the keypoints like it."""
 
-    start: _Start
+    start: MotionStart
     information: FloatArray  # (11, 11)
     vector: FloatArray  # (11,)
     cost: float
@@ -96,50 +71,16 @@ def start_in_motion(
         return None
     sightings = sightings.chosen(np.isin(sightings.keys, chosen))
     gyro_bias = epipolar_bias(sightings, integration, imu.gyro_bias_sigma_radps)
-    start = _linear(sightings, integration, gyro_bias, imu)
+    start = linear_start(sightings, integration, gyro_bias, imu.gravity_mps2)
     fit = _fitted(sightings, integration, start, imu)
     if not _is_good(fit, integration):
         return None
     return _state(fit.start, fit.covariance * _INFLATION, stamp_ns)
 
 
-def _linear(
-    sightings: Sightings, integration: Integration, gyro_bias: FloatArray, imu: ImuQuality
-) -> _Start:
-    """Return velocity and gravity without an accelerometer's bias, from what is linear in them."""
-    down = -integration.mean_force / np.linalg.norm(integration.mean_force)
-    start = _Start(gyro_bias, np.zeros(3), np.zeros(3), down)
-    guess = integration.integrated(gyro_bias[None], np.zeros((1, 3)))
-    group = _grouped(sightings, _clones(guess.R[0], guess.p[0]))
-    rows, centres = group.views.rows, group.views.centres
-    times = (
-        guess.times_s[np.maximum(group.images, 0)][..., None, None]
-        * (group.images >= 0)[..., None, None]
-    )
-    by_speed = np.concatenate([times * np.eye(3), times**2 / 2 * np.eye(3)], axis=-1)
-    squares = np.swapaxes(rows, -1, -2) @ rows  # (F, M, 3, 3)
-    C = squares.sum(1)
-    scale = np.trace(C, axis1=1, axis2=2)[:, None, None]
-    C = np.linalg.inv(C + 1e-9 * scale * np.eye(3))
-    cross = (squares @ by_speed).sum(1)  # (F, 3, 6)
-    known = (squares @ centres[..., None]).sum(1)  # (F, 3, 1)
-    weight = (1 / scale)[:, :, 0]
-    A = (np.swapaxes(by_speed, -1, -2) @ squares @ by_speed).sum(1)
-    A = ((A - np.swapaxes(cross, 1, 2) @ C @ cross) * weight[..., None]).sum(0)
-    b = (np.swapaxes(by_speed, -1, -2) @ squares @ centres[..., None]).sum(1)
-    b = -((b - np.swapaxes(cross, 1, 2) @ C @ known) * weight[..., None]).sum(0)[:, 0]
-    for _ in range(6):
-        free = np.zeros((6, 5))
-        free[:3, :3], free[3:, 3:] = np.eye(3), imu.gravity_mps2 * start.sides
-        fixed = np.append(np.zeros(3), imu.gravity_mps2 * start.down)
-        N = free.T @ A @ free
-        x = np.linalg.solve(N + 1e-12 * np.trace(N) * np.eye(5), free.T @ (b - A @ fixed))
-        step = np.concatenate([np.zeros(6), x[:3] - start.velocity, np.clip(x[3:], -0.5, 0.5)])
-        start = start.moved(step)
-    return start
-
-
-def _fitted(sightings: Sightings, integration: Integration, start: _Start, imu: ImuQuality) -> _Fit:
+def _fitted(
+    sightings: Sightings, integration: Integration, start: MotionStart, imu: ImuQuality
+) -> _Fit:
     """Return the start that fits keypoints best, by Levenberg and Marquardt."""
     weights = np.repeat([imu.gyro_bias_sigma_radps, imu.accel_bias_sigma_mps2, 1e2], 3) ** -2.0
     weights = np.append(weights, [1e-6, 1e-6])
@@ -162,15 +103,15 @@ def _fitted(sightings: Sightings, integration: Integration, start: _Start, imu: 
 def _fit(
     sightings: Sightings,
     integration: Integration,
-    start: _Start,
+    start: MotionStart,
     imu: ImuQuality,
     weights: FloatArray,
 ) -> _Fit:
     guess = _around(integration, start)
-    poses = _poses(guess, start, imu)
-    group = _grouped(sightings, poses)
-    found = eliminate(group, len(poses.clone_ids))
-    J = _by_start(guess, poses, start, imu)
+    places = _places(guess, start, imu)
+    group = grouped(sightings, np.arange(len(places)), guess.R[0], places)
+    found = eliminate(group, len(places))
+    J = _by_start(guess, places, start, imu)
     excess = found.points.cost / np.maximum(
         group.views.freedom, 1
     )  # about 1 for a track without fault
@@ -188,41 +129,33 @@ def _fit(
             ).sum()
         ),
         excess < _FAULT,
-        poses.clone_p[-1] - poses.clone_p[0],
+        places[-1] - places[0],
     )
 
 
-def _around(integration: Integration, start: _Start) -> Integrated:
+def _around(integration: Integration, start: MotionStart) -> Integrated:
     """Return the motion for the biases of the start, and for each of the six moved a little."""
     steps = np.vstack([np.zeros(6), np.eye(6) * _BIAS_STEP])
     return integration.integrated(start.gyro_bias + steps[:, :3], start.accel_bias + steps[:, 3:])
 
 
-def _poses(guess: Integrated, start: _Start, imu: ImuQuality) -> FilterState:
+def _places(guess: Integrated, start: MotionStart, imu: ImuQuality) -> FloatArray:
+    """Return where the IMU was (K, 3) at the images, in the axes of the first."""
     times = guess.times_s[:, None]
     fall = imu.gravity_mps2 * start.down
-    return _clones(guess.R[0], guess.p[0] + start.velocity * times + fall * times**2 / 2)
+    return np.asarray(guess.p[0] + start.velocity * times + fall * times**2 / 2)
 
 
-def _grouped(sightings: Sightings, poses: FilterState) -> Grouped:
-    return grouped(sightings, poses.clone_ids, poses.clone_R, poses.clone_p)
-
-
-def _clones(R: FloatArray, p: FloatArray) -> FilterState:
-    """Return poses of which nothing is known, in the axes of the first."""
-    zero = np.zeros(3)
-    covariance = np.eye(NUM_INERTIAL + 6 * len(R)) * _WIDE
-    return FilterState(0, np.eye(3), zero, zero, zero, zero, covariance, np.arange(len(R)), R, p)
-
-
-def _by_start(guess: Integrated, poses: FilterState, start: _Start, imu: ImuQuality) -> FloatArray:
+def _by_start(
+    guess: Integrated, places: FloatArray, start: MotionStart, imu: ImuQuality
+) -> FloatArray:
     """Return how errors of the poses (6 K, 11), perturbed on the left, follow those of the start."""
     num = len(guess.times_s)
     J = np.zeros((num, 6, 11))
     turned = so3_log(guess.R[1:] @ np.swapaxes(guess.R[0], 1, 2)) / _BIAS_STEP  # (6, K, 3)
     moved = (guess.p[1:] - guess.p[0]) / _BIAS_STEP
     J[:, :3, :6] = np.moveaxis(turned, 0, 2)
-    J[:, 3:, :6] = np.moveaxis(moved, 0, 2) + hat(poses.clone_p) @ J[:, :3, :6]
+    J[:, 3:, :6] = np.moveaxis(moved, 0, 2) + hat(places) @ J[:, :3, :6]
     times = guess.times_s[:, None, None]
     J[:, 3:, 6:9] = times * np.eye(3)
     J[:, 3:, 9:] = times**2 / 2 * imu.gravity_mps2 * start.sides
@@ -243,7 +176,7 @@ def _is_good(fit: _Fit, integration: Integration) -> bool:
     )
 
 
-def _state(start: _Start, covariance: FloatArray, stamp_ns: int) -> FilterState:
+def _state(start: MotionStart, covariance: FloatArray, stamp_ns: int) -> FilterState:
     """Return the start in a frame whose z is up, with its heading and place zero."""
     R = level_attitude(-start.down)
     to_errors = np.zeros((NUM_INERTIAL, 11))

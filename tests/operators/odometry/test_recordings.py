@@ -59,7 +59,7 @@ operators:
   tracks:
     use: klt
     in: {frames: color.frames}
-    config: {max_tracks: 500, min_distance_px: 10}
+    config: {max_tracks: 250}
   points: {use: keypoint_depth, in: {features: tracks.features, depth: registered.depth}}
   n_frames: {use: n_frames, in: {features: points.features}}
   odometry: {use: visual_odometry, in: {n_frames: n_frames.n_frames}, run: inline}
