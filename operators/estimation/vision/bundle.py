@@ -148,7 +148,10 @@ def _taking_part(map_: Map, config: OptimizeConfig) -> tuple[IntArray, dict[Fami
     quality = np.append(map_.landmarks.quality, "bad")
     is_on = {f: f not in config.without and (config.kinds is None or f in config.kinds) for f in FAMILIES}  # fmt: skip
     is_point_like = np.array([shape_of(kind) == "point" for kind in map_.landmarks.kind], bool)
-    rows = np.flatnonzero((quality[seen.landmark] != "bad") & np.append(is_point_like, False)[seen.landmark])  # fmt: skip
+    takes_part = (quality[seen.landmark] != "bad") & np.append(is_point_like, False)[seen.landmark]
+    if config.unanchored == "apart":
+        takes_part &= ~_leaves_the_known(map_)
+    rows = np.flatnonzero(takes_part)
     names, at = sensors_of(map_, rows)
     cameras = all_cameras(map_)
     has_camera = np.array([name in cameras for name in names], bool)[at]
@@ -161,6 +164,14 @@ def _taking_part(map_: Map, config: OptimizeConfig) -> tuple[IntArray, dict[Fami
     is_determined = _determined(map_, rows, families)
     keep = (families["keypoints"] | families["points"]) & is_determined[seen.landmark[rows]]
     return rows[keep], {f: mask[keep] for f, mask in families.items()}
+
+
+def _leaves_the_known(map_: Map) -> BoolArray:
+    """Return which observations (N,) are of a landmark of a mission whose place is known, and their own is not, or the reverse."""
+    seen, is_known = map_.observations, map_.missions.is_base_frame_known
+    at_home = is_known[map_.vertices.mission[map_.landmarks.vertex]]
+    leaves: BoolArray = is_known[map_.vertices.mission[seen.vertex]] != np.append(at_home, False)[seen.landmark]  # fmt: skip
+    return leaves & (seen.landmark >= 0)
 
 
 def _determined(map_: Map, rows: IntArray, families: dict[Family, BoolArray]) -> BoolArray:
@@ -209,7 +220,7 @@ def _sensors(
     return made
 
 
-def _sightings(  # one for each thing that an observation has
+def _sightings(
     map_: Map, family: Family, sensor: int, rows: IntArray, pair: IntArray, config: OptimizeConfig
 ) -> Sightings:
     seen = map_.observations
@@ -217,7 +228,7 @@ def _sightings(  # one for each thing that an observation has
     measured = seen.keypoint_px[rows] if is_px else seen.p_sensor[rows]
     sigmas = seen.sigma[rows].astype(np.float64) if is_px else point_sigmas_m(map_, rows)
     loss = config.losses.get(family, _USUAL_LOSS)
-    gate = config.max_reprojection_error_px / float(np.median(sigmas)) if is_px else np.inf
+    gate = config.max_reprojection_error_px / sigmas if is_px else np.full(len(rows), np.inf)
     return Sightings(
         family=family,
         sensor=sensor,

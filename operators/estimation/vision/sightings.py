@@ -70,7 +70,7 @@ class Sightings:
     sigmas: FloatArray  # (N,) [px] or [m]
     loss: Loss | None
     loss_width: float  # standard deviations
-    gate: float  # standard deviations beyond which an observation is false
+    gate: FloatArray  # (N,) standard deviations beyond which an observation is false
     moments: Moments | None = None  # None: all at the time of their vertex
 
 

@@ -221,7 +221,7 @@ def test_E6_bad_landmarks_are_left_alone() -> None:
 
 
 def test_missions_that_saw_the_same_points_are_one() -> None:
-    """Merged landmarks alone place a mission whose base frame was a guess."""
+    """Merged landmarks alone place a mission whose base frame was a guess, unless it shall be apart."""
     world = World(num_vertices=12)
     other = World(num_vertices=12, start_s=2.0, mission="6b" * 16)
     map_ = with_true_landmarks(world, other.with_odometry(other.map(world.with_odometry(world.map(), noisy=False)), noisy=False))  # fmt: skip
@@ -230,8 +230,10 @@ def test_missions_that_saw_the_same_points_are_one() -> None:
     map_ = replace(map_, missions=replace(map_.missions, T_map_mission=frames))
 
     result, _ = optimize_map(map_)
+    apart, _ = optimize_map(map_, OptimizeConfig(unanchored="apart"))
 
     np.testing.assert_allclose(result.missions.T_map_mission[1], np.eye(4), atol=1e-4)
+    np.testing.assert_allclose(apart.missions.T_map_mission[1], frames[1], atol=1e-4)
 
 
 def test_solvers_without_a_place_for_observations_say_so() -> None:

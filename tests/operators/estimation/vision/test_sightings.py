@@ -59,7 +59,7 @@ def seen_by(sensor: SensorState, rng: np.random.Generator) -> tuple[Sightings, F
         sigmas=rng.uniform(0.5, 2, 6),
         loss=None,
         loss_width=3.0,
-        gate=100.0,
+        gate=np.full(6, 100.0),
         moments=Moments(T, twists),
     )
     return seen, p_vertex
