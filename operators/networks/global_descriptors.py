@@ -52,7 +52,7 @@ class Outputs:
 
 
 class GlobalDescriptors(Operator[Inputs, Outputs]):
-    """Describe images by one vector each; about 12 ms per image.
+    """Describe images by one vector each; about 20 ms per image.
 
     The weights of the default network come with `mapstream models install mobilenet_v2`.
     """
