@@ -13,6 +13,7 @@ from mapstream.recordings.datasets.euroc import convert_euroc
 from mapstream.recordings.datasets.kitti import convert_kitti
 from mapstream.recordings.datasets.kitti_inertial import convert_kitti_inertial, gtsam_data
 from mapstream.recordings.datasets.lidar_bins import convert_lidar_bins
+from mapstream.recordings.datasets.pcd_folder import convert_pcd_folder
 from mapstream.recordings.datasets.seven_scenes import convert_seven_scenes
 from mapstream.recordings.datasets.tum_rgbd import convert_tum_rgbd
 from mapstream.recordings.mcap_whole import whole_mcap
@@ -70,6 +71,9 @@ CONVERTERS = {
         gtsam_data,
     ),
     "lidar_bins": Converter("folder of deskewed scans with alidarPose.csv", convert_lidar_bins),
+    "pcd": Converter(
+        "folder of PCD clouds, with associated.txt or named for stamps", convert_pcd_folder
+    ),
     "rosbag": Converter("ROS 1 bag, rosbag2 or MCAP", convert_rosbag),
     "tum": Converter("folder of a TUM RGB-D sequence, or a TUM trajectory", convert_tum),
     "7scenes": Converter("folder of a 7-Scenes sequence", convert_seven_scenes),
