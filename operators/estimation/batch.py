@@ -71,7 +71,8 @@ def optimize_map(map_: Map, config: OptimizeConfig | None = None) -> tuple[Map, 
         map_ = averaged_landmarks(map_)
     rejected: list[int] = []
     if config.reject_absolute:
-        map_, rejected = without_false_fixes(map_)
+        map_, rejection = without_false_fixes(map_)
+        rejected = rejection.rejected
     result, report, plain = _round(map_, config, started)
     for _ in range(_MOST_INTEGRATIONS - 1):
         if not outdated(result, plain):

@@ -14,9 +14,9 @@ from mapstream.graph.cli.output import JsonFlag, in_place, say, say_json, say_ta
 from mapstream.operators.estimation.outliers.absolute_outliers import (
     RejectAbsoluteConfig,
     RejectAbsoluteReport,
-    reject_absolute,
 )
 from mapstream.operators.estimation.outliers.alignment import AlignConfig, align_missions
+from mapstream.operators.estimation.outliers.fix_judge import without_false_fixes
 from mapstream.operators.maps.missions import find_mission
 from mapstream.operators.maps.outliers import RejectLoopsConfig, RejectLoopsReport, reject_loops
 from mapstream.recordings.maps import Map, load_map, require_valid
@@ -48,7 +48,7 @@ def reject_outliers(
         config = config_from(RejectAbsoluteConfig, set_)
         settings = config.model_dump(mode="json", exclude_defaults=True)
         report = change_map(
-            folder, "reject-outliers", lambda m: reject_absolute(m, config), **settings
+            folder, "reject-outliers", lambda m: without_false_fixes(m, config), **settings
         )
         num = report.num_fixes
     if json:

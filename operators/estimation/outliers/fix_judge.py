@@ -15,7 +15,11 @@ from mapstream.operators.estimation.factors.mounts import MountOf
 from mapstream.operators.estimation.factors.payloads import payloads
 from mapstream.operators.estimation.kinds import make_factors
 from mapstream.operators.estimation.noise import NoiseModels
-from mapstream.operators.estimation.outliers.absolute_outliers import reject_absolute
+from mapstream.operators.estimation.outliers.absolute_outliers import (
+    RejectAbsoluteConfig,
+    RejectAbsoluteReport,
+    reject_absolute,
+)
 from mapstream.operators.estimation.outliers.hypotheses import Fix, FixHypotheses
 from mapstream.operators.estimation.outliers.inertial_steps import InertialStep, inertial_step
 from mapstream.operators.estimation.outliers.lonely_fixes import lonely_fixes
@@ -54,16 +58,26 @@ class FixJudge:
         return found
 
 
-def without_false_fixes(map_: Map) -> tuple[Map, list[int]]:
-    """Return the map with absolute measurements switched as all of them together say, and the rows of false ones.
+def without_false_fixes(
+    map_: Map, config: RejectAbsoluteConfig | None = None
+) -> tuple[Map, RejectAbsoluteReport]:
+    """Return the map with absolute measurements switched as all of them together say, and which are false.
 
     Where odometry leads along a mission, its trajectory says which they are; where only an IMU does, hypotheses.
+
+    Args:
+        map_: Whose missions with odometry have trajectories that are rigid over a window of fixes.
+        config: What counts as a contradiction to such a trajectory.
     """
     linked = set(range(len(map_.missions))) - inertial_missions(map_)
-    map_, report = reject_absolute(map_, missions=linked)
+    map_, report = reject_absolute(map_, config, missions=linked)
     verdicts = FixJudge().verdicts(map_, is_whole=True)
     false = [row for row, is_true in verdicts.items() if not is_true]
-    return with_verdicts(map_, verdicts), sorted(report.rejected + false)
+    return with_verdicts(map_, verdicts), replace(
+        report,
+        num_fixes=report.num_fixes + len(verdicts),
+        rejected=sorted(report.rejected + false),
+    )
 
 
 def with_verdicts(map_: Map, verdicts: Verdicts) -> Map:

@@ -31,6 +31,7 @@ from mapstream.streams.geometry import hat, so3_exp
 _NUM_HEADINGS = 16
 _START_SIGMAS = (0.15, 0.15, 1.2 * np.pi / _NUM_HEADINGS, *[300.0] * 3, *[30.0] * 3)  # rad, m, m/s
 _START_BIAS_SIGMAS = (*[0.5] * 3, *[0.01] * 3)  # m/s^2, rad/s; beyond it headings lose their way
+_DOUBT = 3.0  # times the variance that the IMU's noise is said to have
 _REACH_M = 20.0  # how far a false fix lies from the truth, by order of magnitude
 _FALSE_COST = (
     8.0  # of calling a fix false; dear, since models of an IMU's noise are wrong now and then
@@ -129,7 +130,7 @@ def _moved(beam: _Beam, step: InertialStep) -> _Beam:
     R = beam.R @ step.R
     p = beam.p + beam.v * step.seconds + 0.5 * step.gravity * step.seconds**2 + beam.R @ step.p
     v = beam.v + step.gravity * step.seconds + beam.R @ step.v
-    spread = step.transition @ beam.covariance @ step.transition.T + step.noise
+    spread = step.transition @ beam.covariance @ step.transition.T + _DOUBT * step.noise
     return _shifted(replace(beam, R=R, p=p, v=v, covariance=spread), off)
 
 

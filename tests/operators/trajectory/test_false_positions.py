@@ -153,12 +153,13 @@ async def test_K9_verdicts_on_a_stored_map_do_not_depend_on_what_was_false() -> 
         T_a_b[chosen, :3, 3] += [any_way(rng) for _ in chosen]
         lying = replace(clean.map, edges=replace(clean.map.edges, T_a_b=T_a_b))
 
-        judged, false = without_false_fixes(lying)
+        judged, rejection = without_false_fixes(lying)
         solved, report = optimize_map(
             lying, OptimizeConfig(underconstrained="prior", reject_absolute=True)
         )
 
-        assert false == sorted(chosen.tolist()) == report.rejected_absolute
+        assert rejection.rejected == sorted(chosen.tolist()) == report.rejected_absolute
+        assert rejection.num_fixes == len(rows)
         np.testing.assert_array_equal(judged.edges.switch, solved.edges.switch)
         assert error_m(solved) < 0.3
 
