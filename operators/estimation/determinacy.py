@@ -17,7 +17,7 @@ from mapstream.operators.estimation.fixing import fixes
 from mapstream.operators.estimation.keys import variable_of
 from mapstream.operators.estimation.noise import Factor
 from mapstream.operators.estimation.problem import Problem, describe_variable, graph_of
-from mapstream.operators.estimation.vision.bundle_solver import reduced_normal
+from mapstream.operators.estimation.vision.normal_equations import reduced_normal
 from mapstream.streams.arrays import FloatArray, IntArray
 from mapstream.streams.errors import EstimationError
 

@@ -18,8 +18,8 @@ from mapstream.operators.estimation.problem import make_problem
 from mapstream.operators.estimation.solvers import Graph
 from mapstream.operators.estimation.states import Values
 from mapstream.operators.estimation.vision.bundle import Bundle, Sensor
-from mapstream.operators.estimation.vision.bundle_solver import reduced_normal
 from mapstream.operators.estimation.vision.judging import rms_px
+from mapstream.operators.estimation.vision.normal_equations import reduced_normal
 from mapstream.operators.estimation.vision.sightings import SensorState, intrinsics_of
 from mapstream.operators.operator import OperatorConfig
 from mapstream.recordings.maps.model import Map
