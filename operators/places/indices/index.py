@@ -57,7 +57,7 @@ class IndexConfig(OperatorConfig):
     """For descriptors that are numbers."""
     dimensions: PositiveInt = 10
     """Numbers to which the multi-index projects bits; even."""
-    words: PositiveInt = 24
+    words: PositiveInt = 16
     """Cells that the multi-index looks into: more find more and take longer."""
     exact_up_to: NonNegativeInt = 5_000
     """Descriptors below which the multi-index compares all of them."""

@@ -18,9 +18,9 @@ from mapstream.operators.places.indices.projection import Projection, learn_proj
 from mapstream.recordings.maps.projections import DescriptorProjection
 from mapstream.streams.errors import MapError
 
-_PER_CELL = 200  # descriptors
+_PER_CELL = 100  # descriptors
 _SAMPLE = 50_000  # descriptors from which the cells are learnt
-_GROWTH = 8  # times as many as the cells were learnt from, and they are learnt again
+_GROWTH = 4  # times as many as the cells were learnt from, and they are learnt again
 _BLOCK = 50_000  # descriptors that are projected at once
 
 
