@@ -16,7 +16,9 @@ from mapstream.streams.errors import MapError
 
 
 def select_missions(map_: Map, mission_ids: Sequence[str]) -> Map:
-    """Return the map with these missions alone; edges to others go, and outer frames that none uses.
+    """Return the map with these missions alone; edges to others go, and what none of them uses.
+
+    That is outer frames, and projections of kinds of features.
 
     Raises:
         MapError: If the map has no such mission.
@@ -25,7 +27,8 @@ def select_missions(map_: Map, mission_ids: Sequence[str]) -> Map:
     keep[[map_.mission_row(mission_id) for mission_id in mission_ids]] = True
     chosen = map_.select(missions=keep)
     used = np.isin(np.arange(len(chosen.frames)), chosen.edges.frame)
-    return chosen.select(frames=used)
+    learnt = np.isin(chosen.projections.kind.astype(str), chosen.feature_sets.kind.astype(str))
+    return chosen.select(frames=used, projections=learnt)
 
 
 def merge_maps(maps: Sequence[Map], *, share_frame: bool = False) -> Map:

@@ -205,6 +205,22 @@ def feature_sets_are_whole(map_: Map) -> Iterable[Finding]:
     )
 
 
+def projections_are_whole(map_: Map) -> Iterable[Finding]:
+    """A projection has a use, and finite numbers, as many as it says."""
+    table = map_.projections
+    sizes = {"mean": table.num_inputs, "matrix": table.num_inputs * table.num_outputs}
+    for name, size in sizes.items():
+        blocks = getattr(table, name)
+        broken = [
+            len(data) != 4 * count or not np.isfinite(np.frombuffer(data, "<f4")).all()
+            for data, count in zip(blocks, size.tolist(), strict=True)
+        ]
+        found = np.array(broken, dtype=bool)
+        yield from where(found, "projections", f"its {name} is not finite, or of another size")
+    unknown = ~np.isin(table.use.astype(str), ["compression", "index"])
+    yield from where(unknown, "projections", lambda row: f"a projection for {table.use[row]!r}")
+
+
 def texts_are_json(map_: Map) -> Iterable[Finding]:
     """Sensor sets and parameters of the journal are JSON objects."""
     for table, texts in (
@@ -252,6 +268,7 @@ VALUE_RULES: tuple[Rule, ...] = (
     observations_say_something,
     observations_have_an_uncertainty,
     feature_sets_are_whole,
+    projections_are_whole,
     texts_are_json,
     resources_stay_in_the_folder,
 )

@@ -11,6 +11,7 @@ import numpy as np
 from mapstream.recordings.maps.build import append_edges
 from mapstream.recordings.maps.ids import derived_id, id_array
 from mapstream.recordings.maps.model import Map
+from mapstream.recordings.maps.projections import DescriptorProjection, with_projection
 from mapstream.recordings.maps.submaps import append_submap
 from mapstream.recordings.maps.tables import (
     Edges,
@@ -138,6 +139,8 @@ def full_map() -> Map:
         feature_sets=feature_sets,
         observations=observations,
     )
+    mean, matrix = np.zeros(2, np.float32), np.ones((2, 1), np.float32)
+    map_ = with_projection(map_, DescriptorProjection("sift", "compression", mean, matrix))
     fix = Edges(
         kind=np.array(["absolute"], dtype=object), vertex_a=np.array([2]), frame=np.array([0])
     )

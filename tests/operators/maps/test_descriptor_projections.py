@@ -32,7 +32,7 @@ from mapstream.operators.tracking.descriptor_matching import MatchRules, matched
 from mapstream.recordings.maps import Map, check_map, load_map, save_map
 from mapstream.recordings.maps.combine import merge_maps, select_missions
 from mapstream.recordings.maps.features import descriptors_of
-from mapstream.recordings.maps.projections import as_numbers, projections_of
+from mapstream.recordings.maps.projections import as_numbers, projections_of, with_projection
 from mapstream.streams.errors import ConfigError, MapError
 from mapstream.streams.messages.vision import ImageFeatures
 from tests.operators.places import descriptors as made
@@ -223,8 +223,10 @@ def test_projections_are_there_once_after_maps_come_together(of_numbers: Map) ->
     place = made_maps.room(of_numbers=True)
     other = made_maps.flown(Map.empty(), place, B, made_maps.circle(4), FRONT)
     both = merge_maps([small, other])
+    learnt = projections_of(small, "compression")[made_maps.KIND]
 
-    for together in (merge([small, both])[0], merge_maps([both, select_missions(small, [])])):
+    alone = select_missions(both, [B])
+    for together in (merge([small, both])[0], merge_maps([small, with_projection(alone, learnt)])):
         assert len(together.projections) == 1
         assert check_map(together) == []
 
