@@ -12,9 +12,11 @@ from mapstream.operators.landmarks.locating import LocateConfig
 from mapstream.operators.landmarks.motion import Motion, moments
 from mapstream.operators.landmarks.views import reprojection_errors_px
 from mapstream.recordings.maps.check import check_map
+from mapstream.recordings.maps.features import add_features
 from mapstream.recordings.maps.tables import Observations
 from mapstream.streams.calibration import CameraCalibration
-from mapstream.streams.geometry import invert, se3_exp, se3_log
+from mapstream.streams.geometry import SE3, invert, se3_exp, se3_log
+from mapstream.streams.messages.vision import ImageFeatures
 from tests.operators.vision_worlds import World, landmark_errors_m, poses_at, stereo
 
 FISHEYE = CameraCalibration(
@@ -170,3 +172,24 @@ def test_A22_rows_of_a_rolling_shutter_are_seen_one_after_another() -> None:
 
     assert np.nanmedian(reprojection_errors_px(known, rows)) < 0.02
     assert np.nanmedian(reprojection_errors_px(ignorant, rows)) > 0.3
+
+
+def test_E3_points_of_a_sensor_that_is_no_camera_lie_where_it_sits() -> None:
+    """Its place comes with its features, and stays in the map."""
+    world = World(num_points=10, num_vertices=3, cameras={})
+    place = SE3.exp([0.1, -0.2, 0.3, 0.5, 0.1, 0.2])
+    T = world.poses @ place.matrix
+    p = np.einsum("nji,nkj->nki", T[:, :3, :3], world.points[None] - T[:, None, :3, 3])
+    map_ = world.map()
+    seen = [
+        (row, int(stamp_ns), ImageFeatures(
+            stamp_ns=int(stamp_ns), kind="corner", frame="lidar", keypoints_px=np.zeros((10, 2), np.float32),
+            track_ids=np.arange(10), points_m=p[row].astype(np.float32), T_base_sensor=place,
+        ))
+        for row, stamp_ns in enumerate(world.stamps_ns)
+    ]  # fmt: skip
+
+    made, report = create_landmarks(add_features(map_, 0, seen))
+
+    assert report.num_found == 10
+    assert landmark_errors_m(world, made).max() < 1e-5
