@@ -33,10 +33,8 @@ _START_SIGMAS = (0.15, 0.15, 1.2 * np.pi / _NUM_HEADINGS, *[300.0] * 3, *[30.0] 
 _START_BIAS_SIGMAS = (*[0.5] * 3, *[0.01] * 3)  # m/s^2, rad/s; beyond it headings lose their way
 _DOUBT = 3.0  # times the variance that the IMU's noise is said to have
 _REACH_M = 20.0  # how far a false fix lies from the truth, by order of magnitude
-_FALSE_COST = (
-    8.0  # of calling a fix false; dear, since models of an IMU's noise are wrong now and then
-)
-_FURTHEST_COST = 40.0  # more than the best hypothesis' that one may have
+_FALSE_COST = 8.0  # of calling a fix false; dear, as models of noise are wrong now and then
+_FURTHEST_COST = 40.0  # more than the best hypothesis has that one may have
 _LIKELY_COST = 12.0  # more than the best's that one has which still sheds doubt on a verdict
 _MOST = 600  # hypotheses
 _DECIDED_AFTER = 20  # fixes
