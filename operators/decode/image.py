@@ -1,8 +1,8 @@
-"""Compressed images to pixels."""
+"""Images of any recording, compressed or not, to pixels of one kind."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import cv2
@@ -26,6 +26,9 @@ _SEEN = {  # by dtype and number of dimensions
     ("uint16", 2): "mono16",
     ("float32", 2): "32FC1",
 }
+_WANTED = {"color": "bgr8", "gray": "mono8", "depth": "16UC1"}
+_TO_GRAY = {"bgr8": cv2.COLOR_BGR2GRAY, "rgb8": cv2.COLOR_RGB2GRAY}
+_TO_COLOR = {"mono8": cv2.COLOR_GRAY2BGR, "rgb8": cv2.COLOR_RGB2BGR}
 _DEPTH = {("uint16", 2): "16UC1", ("float32", 2): "32FC1"}
 
 
@@ -44,7 +47,7 @@ class ImageDecodeConfig(OperatorConfig):
 
 @dataclass(frozen=True)
 class Inputs:
-    images: Receiver[EncodedImage]
+    images: Receiver[EncodedImage | CameraFrame]
 
 
 @dataclass(frozen=True)
@@ -55,12 +58,14 @@ class Outputs:
 class ImageDecode(Operator[Inputs, Outputs]):
     """Decode JPEG, PNG and what else OpenCV reads; one that cannot be decoded is dropped and counted.
 
+    Images that were recorded as pixels are converted alike, so that a graph takes both.
     OpenCV frees the interpreter while it decodes, so several workers decode at the same time.
     """
 
     placement = "thread"
 
     def __init__(self, config: ImageDecodeConfig) -> None:
+        self._mode = config.mode
         self._flag = _FLAGS[config.mode]
         self._encodings = _DEPTH if config.mode == "depth" else _SEEN
         self._on_wrong_size = config.on_wrong_size
@@ -77,8 +82,11 @@ class ImageDecode(Operator[Inputs, Outputs]):
 
         await pipeline(self.decode, inputs.images, send)
 
-    def decode(self, image: EncodedImage) -> CameraFrame | _Refused:
+    def decode(self, image: EncodedImage | CameraFrame) -> CameraFrame | _Refused:
         """Decode one image."""
+        if isinstance(image, CameraFrame):
+            converted = _converted(image, self._mode)
+            return self._fitted(converted) if isinstance(converted, CameraFrame) else converted
         try:
             pixels = cv2.imdecode(image.data, self._flag) if image.data.size else None
         except cv2.error:
@@ -90,7 +98,7 @@ class ImageDecode(Operator[Inputs, Outputs]):
         encoding = self._encodings.get((pixels.dtype.name, pixels.ndim))
         if encoding is None:
             return _undecodable(image, f"{image.format} of {pixels.dtype}")
-        frame = CameraFrame(
+        decoded = CameraFrame(
             stamp_ns=image.stamp_ns,
             image=pixels,
             encoding=encoding,
@@ -99,8 +107,11 @@ class ImageDecode(Operator[Inputs, Outputs]):
             camera=image.camera,
             record=image.record,
         )
+        return self._fitted(decoded)
+
+    def _fitted(self, frame: CameraFrame) -> CameraFrame | _Refused:
         result = fitted(frame, self._on_wrong_size)
-        return _Refused(image.stamp_ns, result) if isinstance(result, str) else result
+        return _Refused(frame.stamp_ns, result) if isinstance(result, str) else result
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,5 +120,23 @@ class _Refused:
     reason: str
 
 
-def _undecodable(image: EncodedImage, what: str) -> _Refused:
+def _converted(frame: CameraFrame, mode: str) -> CameraFrame | _Refused:
+    """Return pixels as OpenCV would have decoded them from a file; those that fit already are not copied."""
+    image, encoding = frame.image, frame.encoding
+    if mode == "as_recorded" or encoding == _WANTED.get(mode):
+        return frame
+    if mode == "depth" and encoding in ("mono16", "32FC1"):
+        return replace(frame, encoding="16UC1" if encoding == "mono16" else encoding)
+    if mode == "gray" and encoding in _TO_GRAY:
+        gray = np.asarray(cv2.cvtColor(image, _TO_GRAY[encoding]), np.uint8)
+        return replace(frame, image=gray, encoding="mono8")
+    if mode == "gray" and encoding == "mono16":
+        return replace(frame, image=(image >> 8).astype(np.uint8), encoding="mono8")
+    if mode == "color" and encoding in _TO_COLOR:
+        color = np.asarray(cv2.cvtColor(image, _TO_COLOR[encoding]), np.uint8)
+        return replace(frame, image=color, encoding="bgr8")
+    return _undecodable(frame, f"{encoding} as {mode}")
+
+
+def _undecodable(image: EncodedImage | CameraFrame, what: str) -> _Refused:
     return _Refused(image.stamp_ns, f"images of {image.frame} that cannot be decoded ({what})")

@@ -59,7 +59,7 @@ def read_rig(folder: Path) -> tuple[Rig, tuple[str, ...]]:
     )
     sensor = CameraSensor(
         id=derived_id("sensor", "tum", FRAME).hex(),
-        topic="/camera/image",
+        topic="/color/image",
         description="Kinect",
         frame=FRAME,
         calibration=calibration,

@@ -30,13 +30,13 @@ from mapstream.recordings.odometry_files import read_odometry
 from mapstream.streams.arrays import IntArray
 from mapstream.streams.errors import RecordingError
 
-COLOR, DEPTH, TRUTH = "/camera/image", "/camera/depth", "/truth"
+COLOR, DEPTH, TRUTH = "/color/image", "/depth/image", "/truth"
 _UNITS_PER_M = 5000.0
 _Listed = list[tuple[int, Path]]  # stamps and files
 
 
 def convert_tum_rgbd(source: Path, writer: McapWriter, on_progress: Progress) -> Notices:
-    """Write `/camera/image`, `/camera/depth` in millimetres and `/truth`, and attach the sensor file."""
+    """Write `/color/image`, `/depth/image` in millimetres and `/truth`, and attach the sensor file."""
     colors, depths = (_listed(source / name) for name in ("rgb.txt", "depth.txt"))
     rig, notices = read_rig(source)
     attach_rig(writer, rig)

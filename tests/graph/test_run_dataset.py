@@ -43,7 +43,7 @@ def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 _SETS: dict[str, tuple[Callable[[Path], Path], str, int]] = {  # images of one camera, and how many
     "euroc": (made_datasets.euroc, "/cam1/image", 1),
     "kitti": (made_datasets.kitti, "/cam1/image", 2),
-    "tum": (made_datasets.tum, "/camera/image", 1),
+    "tum": (made_datasets.tum, "/color/image", 1),
     "7scenes": (made_datasets.seven_scenes, "/color/image", 2),
 }
 

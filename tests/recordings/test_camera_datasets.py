@@ -102,7 +102,7 @@ def test_kitti_folders_that_do_not_fit_together_are_refused(kitti: Path, tmp_pat
 def test_A24_tum_folder_with_the_published_calibration(tum: Path, tmp_path: Path) -> None:
     done = convert(f"tum:{tum}", tmp_path / "out.mcap")
 
-    (color,), (depth,) = decoded(done.path, "/camera/image"), decoded(done.path, "/camera/depth")
+    (color,), (depth,) = decoded(done.path, "/color/image"), decoded(done.path, "/depth/image")
     assert (color.stamp_ns, depth.stamp_ns) == (1305031102175304000, 1305031102160407000)
     assert (color.frame, depth.frame) == ("camera", "camera")
     assert depth_mm(depth) == [[0, 1000, 13107], [2000, 0, 500]]
@@ -124,7 +124,7 @@ def test_A24_tum_key_frames_take_the_stamps_of_their_poses(tum: Path, tmp_path: 
 
     done = convert(f"tum:{tum}", tmp_path / "out.mcap")
 
-    for topic in ("/camera/image", "/camera/depth", "/truth"):
+    for topic in ("/color/image", "/depth/image", "/truth"):
         assert [m.stamp_ns for m in decoded(done.path, topic)] == [10_500_000_000, 11_500_000_000]
     camera = calibration(done.path, "camera")
     assert (camera.focal_px.tolist(), camera.distortion) == ([535.4, 539.2], "none")
@@ -242,7 +242,7 @@ def test_A24_real_kitti_stereo(tmp_path: Path) -> None:
 def test_A24_real_tum_key_frames(tmp_path: Path) -> None:
     done = convert(f"tum:{shared('tum_fr3_cabinet_rgbd')}", tmp_path / "out.mcap")
 
-    assert decoded(done.path, "/camera/depth")[57].stamp_ns == 1341841317250600000
+    assert decoded(done.path, "/depth/image")[57].stamp_ns == 1341841317250600000
     assert done.notices == ()
 
 

@@ -1,5 +1,7 @@
 """Compressed images become pixels; broken ones are counted and hold nobody up."""
 
+from typing import Literal
+
 import cv2
 import numpy as np
 import pytest
@@ -8,7 +10,7 @@ from mapstream.operators.decode.image import ImageDecode, ImageDecodeConfig
 from mapstream.operators.operator import Context
 from mapstream.operators.testing import run_operator
 from mapstream.streams.geometry import SE3
-from mapstream.streams.messages.sensors import EncodedImage
+from mapstream.streams.messages.sensors import CameraFrame, EncodedImage
 
 pytestmark = pytest.mark.anyio
 _COLOR = np.random.default_rng(0).integers(0, 255, (20, 30, 3), np.uint8)
@@ -64,3 +66,55 @@ async def test_an_image_that_cannot_be_decoded_is_counted_and_the_rest_goes_on()
 
     assert [frame.stamp_ns for frame in out["frames"]] == [0, 3]
     assert run_context.activity.losses == {"images of cam that cannot be decoded (jpeg)": 2}
+
+
+@pytest.mark.parametrize(
+    ("encoding", "mode", "expected"),
+    [
+        ("bgr8", "gray", "mono8"),
+        ("rgb8", "gray", "mono8"),
+        ("mono8", "gray", "mono8"),
+        ("mono16", "gray", "mono8"),
+        ("mono8", "color", "bgr8"),
+        ("rgb8", "color", "bgr8"),
+        ("mono16", "depth", "16UC1"),
+        ("16UC1", "depth", "16UC1"),
+        ("32FC1", "depth", "32FC1"),
+        ("rgb8", "as_recorded", "rgb8"),
+    ],
+)
+def test_recorded_pixels_become_what_a_decoded_file_would_be(
+    encoding: str, mode: Literal["gray", "color", "depth", "as_recorded"], expected: str
+) -> None:
+    rng = np.random.default_rng(0)
+    shape = (6, 8, 3) if encoding in ("bgr8", "rgb8") else (6, 8)
+    dtype = {"mono16": np.uint16, "16UC1": np.uint16, "32FC1": np.float32}.get(encoding, np.uint8)
+    image = (rng.uniform(0, 1, shape) * 255).astype(dtype)
+    frame = CameraFrame(stamp_ns=1, image=image, encoding=encoding)
+
+    made = ImageDecode(ImageDecodeConfig(mode=mode)).decode(frame)
+
+    assert isinstance(made, CameraFrame)
+    assert made.encoding == expected
+    if encoding == "rgb8" and mode == "color":
+        np.testing.assert_array_equal(made.image, image[:, :, ::-1])
+    if (encoding, mode) == ("bgr8", "gray"):  # as the file of the same pixels
+        data = np.frombuffer(cv2.imencode(".png", image)[1].tobytes(), np.uint8)
+        file = EncodedImage(stamp_ns=1, data=data, format="png")
+        decoded = ImageDecode(ImageDecodeConfig(mode="gray")).decode(file)
+        assert isinstance(decoded, CameraFrame)
+        assert np.abs(made.image.astype(int) - decoded.image.astype(int)).max() <= 1
+
+
+async def test_recorded_pixels_that_are_no_depth_are_refused_and_counted() -> None:
+    context = Context()
+    frame = CameraFrame(stamp_ns=1, image=np.zeros((6, 8), np.uint8), encoding="mono8")
+
+    sent = await run_operator(
+        ImageDecode(ImageDecodeConfig(mode="depth")), run_context=context, images=[frame]
+    )
+
+    assert sent["frames"] == []
+    assert context.activity.losses == {
+        "images of camera that cannot be decoded (mono8 as depth)": 1
+    }
