@@ -26,12 +26,16 @@ class ImuSamples:
         self.T_base_imu = SE3.identity()
 
     @property
+    def is_empty(self) -> bool:
+        return len(self._stamps_ns) == 0
+
+    @property
     def start_ns(self) -> int:
         return int(self._stamps_ns[0])
 
     @property
     def end_ns(self) -> int:
-        return int(self._stamps_ns[-1]) if len(self._stamps_ns) else -(2**62)
+        return -(2**62) if self.is_empty else int(self._stamps_ns[-1])
 
     def add(self, batch: ImuBatch) -> None:
         newest = np.maximum.accumulate(np.append(self.end_ns, batch.stamps_ns))

@@ -106,7 +106,7 @@ class VisualInertialOdometry(Operator[Inputs, Outputs]):
         if self._last_ns is not None and stamp_ns <= self._last_ns:
             warn("n-frames whose stamp does not increase were left out")
             return []
-        if self._samples.end_ns < 0 or stamp_ns < self._samples.start_ns:
+        if self._samples.is_empty or stamp_ns < self._samples.start_ns:
             warn("n-frames before the first sample of the IMU were left out")
             return []
         self._last_ns = stamp_ns
@@ -115,6 +115,7 @@ class VisualInertialOdometry(Operator[Inputs, Outputs]):
             return [self._step(self._filter, stamp_ns, rays)]
         state = self._starter.add(stamp_ns, rays, self._samples)
         if state is None:
+            self._samples.forget(self._starter.held[0].stamp_ns)
             return []
         return self._started(state)
 

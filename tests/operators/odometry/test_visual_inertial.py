@@ -17,6 +17,7 @@ from mapstream.operators.testing import run_operator
 from mapstream.operators.trajectory.config import ImuConfig
 from mapstream.recordings.evaluation import align, ape
 from mapstream.recordings.pose_pairs import PosePairs
+from mapstream.streams.errors import EstimationError
 from mapstream.streams.messages.estimates import Odometry
 from mapstream.streams.messages.sensors import ImuBatch
 from mapstream.streams.messages.vision import NFrame
@@ -185,6 +186,28 @@ async def test_no_image_at_all_is_no_odometry_and_a_warning() -> None:
 
     assert await estimate(frames, flight.imu(), context) == []
     assert any("no start" in each for each in context.activity.warnings)
+
+
+async def test_a_camera_without_calibration_is_named() -> None:
+    flight = Flight(duration_s=1.0)
+    frames = [replace(f, features=(replace(f.features[0], camera=None),)) for f in flight.frames()]
+
+    with pytest.raises(EstimationError, match="'cam0' without a camera model"):
+        await estimate(frames, flight.imu())
+
+
+async def test_clocks_that_are_apart_are_named() -> None:
+    flight = Flight(duration_s=2.0)
+    imu = flight.imu()
+    early = replace(imu, stamps_ns=imu.stamps_ns + 3_600_000_000_000)
+    late = replace(imu, stamps_ns=imu.stamps_ns - 3_600_000_000_000)
+    contexts = Context(), Context()
+
+    assert await estimate(flight.frames(), early, contexts[0]) == []
+    assert await estimate(flight.frames(), late, contexts[1]) == []
+
+    assert any("before the first sample" in each for each in contexts[0].activity.warnings)
+    assert any("no start" in each for each in contexts[1].activity.warnings)
 
 
 async def test_images_that_stay_dark_start_anew_where_the_robot_was() -> None:
