@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from abc import abstractmethod
+
 import anyio.to_thread
 import numpy as np
 from pydantic import Field, PositiveFloat, PositiveInt
@@ -33,9 +35,9 @@ class LearnedFeatures(FeatureFinder):
         self._sigma_px = config.sigma_px / config.image_scale
         self._network: KeypointNetwork | None = None
 
+    @abstractmethod
     def open(self) -> KeypointNetwork:
         """Return the network, ready to run."""
-        raise NotImplementedError
 
     async def run(self, inputs: Inputs, outputs: Outputs) -> None:
         self._network = await anyio.to_thread.run_sync(self.open)

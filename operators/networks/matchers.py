@@ -20,7 +20,9 @@ from mapstream.streams.errors import ConfigError, OperatorError
 from mapstream.streams.messages.vision import ImageFeatures
 
 NO_MATCHES = np.empty((0, 2), np.int64)
-_INSTALLED = ("lighterglue",)
+_LIGHTGLUE = ("kpts", "desc")  # inputs, each once for either image
+_SUPERGLUE = ("keypoints", "scores", "descriptors")
+_SCORES = ("mscores0", "matching_scores0")
 
 
 class Matcher(Protocol):
@@ -42,9 +44,7 @@ def make_matcher(model: str, min_score: float) -> Matcher:
         return NetworkMatcher(session, min_score)
     file = Path(model)
     if not file.suffix:
-        raise ConfigError(
-            f"no matcher {model!r}; expected {' or '.join(_INSTALLED)}, or an ONNX file"
-        )
+        raise ConfigError(f"no matcher {model!r}; expected lighterglue, or an ONNX file")
     return NetworkMatcher(Session(file, file.name), min_score)
 
 
@@ -106,11 +106,6 @@ class NetworkMatcher:
             turned = features.descriptors.T[None]
             return {f"keypoints{i}": px, f"scores{i}": scores[None], f"descriptors{i}": turned}
         return {f"kpts{i}": px, f"desc{i}": features.descriptors[None]}
-
-
-_LIGHTGLUE = ("kpts", "desc")
-_SUPERGLUE = ("keypoints", "scores", "descriptors")
-_SCORES = ("mscores0", "matching_scores0")
 
 
 def normalized_px(features: ImageFeatures) -> Float32Array:

@@ -177,7 +177,7 @@ def test_keypoints_are_scaled_by_the_image() -> None:
 
 
 @pytest.mark.slow
-async def test_D12_E16_xfeat_and_lighterglue_follow_points_through_ten_images() -> None:
+async def test_D12_xfeat_and_lighterglue_follow_points_through_ten_images() -> None:
     """In a walk through W-VI: at least 80 tracks span ten images, 95 % of them on one point to 4 px."""
     installed("xfeat", "lighterglue")
     views = walk(11, 0)
