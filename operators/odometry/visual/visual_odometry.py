@@ -20,7 +20,7 @@ from mapstream.streams.channel import Receiver, Sender
 from mapstream.streams.errors import EstimationError
 from mapstream.streams.geometry import SE3, invert, straightened
 from mapstream.streams.messages.estimates import Odometry
-from mapstream.streams.messages.vision import NFrame
+from mapstream.streams.messages.vision import ImageFeatures, NFrame
 
 _LEAST_SHARE = 0.5  # of the known points must agree with a pose that was predicted
 
@@ -36,7 +36,7 @@ class VisualOdometryConfig(OperatorConfig):
     """So many are refined together."""
     keyframe_overlap: float = Field(default=0.7, gt=0, le=1)
     """With a smaller share of the last keyframe's points in view a new keyframe is made."""
-    num_points: int = Field(default=8, ge=4)
+    min_points: int = Field(default=8, ge=4)
     """So many known points must agree, or the n-frame is lost."""
     max_lost: int = Field(default=5, ge=1)
     """After so many lost n-frames the local map starts anew at the predicted pose."""
@@ -76,6 +76,7 @@ class VisualOdometry(Operator[Inputs, Outputs]):
         self._covariance: FloatArray = np.zeros((6, 6))  # of the last pose, perturbed on the right
         self._last_ns: int | None = None
         self._num_known = 0  # points of the last keyframe
+        self._described: list[ImageFeatures] = []  # keypoints of now that came without tracks
         self._num_lost = 0
 
     async def run(self, inputs: Inputs, outputs: Outputs) -> None:
@@ -126,7 +127,7 @@ class VisualOdometry(Operator[Inputs, Outputs]):
         rows = self._map.found(sightings.keys)
         known = sightings.chosen(rows >= 0)
         rows = self._map.found(np.unique(known.keys))
-        least = self._config.num_points
+        least = self._config.min_points
         if len(rows) < least:
             raise EstimationError("too few known points are in view")
         points = self._map.positions[rows], self._map.roots[rows]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,9 +12,12 @@ from mapstream.graph.load import load_graph
 from mapstream.graph.plan import plan
 from mapstream.graph.run import run_graph
 from mapstream.recordings.datasets.catalogue import convert
-from mapstream.recordings.evaluation import ape, associate
+from mapstream.recordings.decoding import decoder_for
+from mapstream.recordings.evaluation import align, ape, associate
 from mapstream.recordings.pose_pairs import PosePairs
+from mapstream.recordings.recording import open_recording
 from mapstream.recordings.trajectory_files import read_kitti, read_tum
+from mapstream.recordings.worlds.catalogue import simulate
 from mapstream.streams.geometry import invert, rotation_from_quat_xyzw
 from mapstream.streams.trajectory import Trajectory
 from tests.data import shared
@@ -63,6 +67,21 @@ operators:
   points: {use: keypoint_depth, in: {features: tracks.features, depth: registered.depth}}
   n_frames: {use: n_frames, in: {features: points.features}}
   odometry: {use: visual_odometry, in: {n_frames: n_frames.n_frames}, run: inline}
+  path: {use: trajectory_sink, in: {odometry: odometry.odometry}, config: {path: OUT}}
+"""
+MONO = """
+version: 1
+name: mono
+operators:
+  sensors: {use: mcap, config: {path: RECORDING, topics: {images: /front_left/image, imu: /imu}}}
+  frames: {use: image_decode, in: {images: sensors.images}}
+  tracks: {use: klt, in: {frames: frames.frames, imu: sensors.imu}, config: {min_distance_px: 10}}
+  n_frames: {use: n_frames, in: {features: tracks.features}}
+  odometry:
+    use: visual_inertial_odometry
+    in: {n_frames: n_frames.n_frames, imu: sensors.imu}
+    config: {imu: {recording: RECORDING}}
+    run: inline
   path: {use: trajectory_sink, in: {odometry: odometry.odometry}, config: {path: OUT}}
 """
 STANDING = """
@@ -121,6 +140,32 @@ async def test_C9_euroc_v1_01_for_30_s(tmp_path: Path) -> None:
     assert len(found) == 601
     errors = ape(associate(found, reference))
     assert errors.translation.rmse < 0.05
+
+
+@pytest.mark.slow
+async def test_A2_C9_one_camera_and_an_imu_fly_through_w_vi(tmp_path: Path) -> None:
+    recording = simulate(
+        "w_vi",
+        tmp_path / "world.mcap",
+        cameras=["front_left"],
+        camera={"width_px": 320, "height_px": 240, "rate_hz": 10.0},
+        flight={"duration_s": 6.0, "start": "moving"},
+        texel_m=0.01,
+    )
+    with open_recording(recording) as source:
+        decode = decoder_for(source.topics["/truth"].channel)
+        truth: list[Any] = [decode(message) for message in source.messages(topics=["/truth"])]
+    reference = Trajectory(
+        stamps_ns=np.array([pose.stamp_ns for pose in truth]),
+        poses=np.array([pose.T_odom_base.matrix for pose in truth]),
+    )
+
+    found = await run(MONO, recording, tmp_path)
+
+    pairs = associate(found, reference)
+    assert len(pairs) > 30
+    assert ape(pairs).translation.rmse < 0.10
+    assert align(pairs, "sim3").scale == pytest.approx(1, abs=0.02)
 
 
 @pytest.mark.slow
