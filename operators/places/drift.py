@@ -115,10 +115,8 @@ class Drift:
 
     def T_map_odom(self, stamp_ns: int) -> SE3 | None:
         """Return where the odometry's frame lies in the map at a moment; None while the robot is lost."""
-        target, since_s = (
-            None if self.is_lost else self._T_map_odom,
-            (stamp_ns - self._shown_ns) / 1e9,
-        )
+        target = None if self.is_lost else self._T_map_odom
+        since_s = (stamp_ns - self._shown_ns) / 1e9
         self._shown_ns = stamp_ns
         if target is None or self._shown is None or not self._config.smooth_mps:
             self._shown = target
