@@ -25,6 +25,7 @@ from mapstream.streams.arrays import Float32Array, FloatArray, IntArray
 from mapstream.streams.errors import MapError
 
 _SEED = 1
+_MIN_PAIRS = 100  # to learn from
 _RIDGE = 1.0  # of the mean variance, added to what descriptors of one point differ by
 
 
@@ -66,7 +67,9 @@ class Training:
 
     kind: str
     num_pairs: int
-    separation: float  # squared length of differences of two points, over that of one point
+    separation: (
+        float  # squared length of differences of two points over those of one, not learnt from
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -164,16 +167,28 @@ def train_projection(map_: Map, config: TrainProjectionConfig) -> tuple[Map, Tra
     Points are known by their landmarks, and where there are none by their tracks.
 
     Raises:
-        MapError: If there are no such descriptors, or no point of a kind is seen twice.
+        MapError: If there are no such descriptors, or too few points of a kind are seen twice.
     """
     done = []
     for kind in _kinds(map_, config.kind, "uint8"):
         same, different = _pairs(map_, kind, config.max_pairs)
         projection = separating(same, different, kind, config.dimensions)
-        apart, together = (((d @ projection.matrix) ** 2).sum(1).mean() for d in (different, same))
         map_ = with_projection(map_, projection)
-        done.append(Training(kind=kind, num_pairs=len(same), separation=float(apart / together)))
+        done.append(
+            Training(
+                kind=kind, num_pairs=len(same), separation=_separation(same, different, config)
+            )
+        )
     return map_, TrainReport(tuple(done))
+
+
+def _separation(
+    same: Float32Array, different: Float32Array, config: TrainProjectionConfig
+) -> float:
+    """Return how much better every other pair is told apart by what the pairs between them teach."""
+    half = separating(same[::2], different[::2], "", config.dimensions)
+    apart, together = (((d[1::2] @ half.matrix) ** 2).sum(1).mean() for d in (different, same))
+    return float(apart / together)
 
 
 def separating(
@@ -206,8 +221,11 @@ def _pairs(map_: Map, kind: str, max_pairs: int) -> tuple[Float32Array, Float32A
     rows, point = _points(map_, kind)
     rng = np.random.default_rng(_SEED)
     first = np.flatnonzero(point[1:] == point[:-1])
-    if len(first) == 0:
-        raise MapError(f"no point of kind {kind} was seen twice; track them first")
+    if len(first) < _MIN_PAIRS:
+        raise MapError(
+            f"{len(first)} pairs of keypoints of kind {kind} are of one point, expected at least "
+            f"{_MIN_PAIRS}; track them first"
+        )
     first = rng.permutation(first)[:max_pairs]
     a, b = rng.integers(0, len(rows), (2, len(first)))
     is_apart = point[a] != point[b]
