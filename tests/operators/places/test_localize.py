@@ -58,6 +58,7 @@ def _error_m(pose: MapPose, truth: SE3) -> float:
     return float(np.linalg.norm(pose.T_map_base.t - truth.t))
 
 
+@pytest.mark.slow
 async def test_H12_frames_alone_are_found_in_the_map(folder: Path) -> None:
     truth = _drive(24)
     frames = [_frame(pose, k) for k, pose in enumerate(truth)]
@@ -70,6 +71,7 @@ async def test_H12_frames_alone_are_found_in_the_map(folder: Path) -> None:
     assert np.median(errors) < 0.05
 
 
+@pytest.mark.slow
 async def test_H13_odometry_that_drifts_is_held_in_the_map(folder: Path) -> None:
     truth = _drive(40)
     odometry = _odometry(made_maps.drifted([truth[0].inverse() @ pose for pose in truth]))
@@ -93,6 +95,7 @@ async def test_H13_odometry_that_drifts_is_held_in_the_map(folder: Path) -> None
     assert len(out["odometry"]) == len(found)
 
 
+@pytest.mark.slow
 async def test_U1_a_robot_that_was_carried_elsewhere_is_recovered(folder: Path) -> None:
     truth = [*_drive(60)[:16], *_drive(60)[40:60]]
     frames = [_frame(pose, k) for k, pose in enumerate(truth)]

@@ -61,6 +61,7 @@ def test_H1_a_frame_has_many_matches_and_most_are_true(lap: Map, database: Place
         assert is_true.mean() >= 0.6
 
 
+@pytest.mark.slow
 def test_H4_random_matches_are_removed_by_what_places_see_in_common() -> None:
     """In a building of sixteen rooms, half of the matches are of random landmarks, as random vertices saw them."""
     map_, poses = Map.empty(), made_maps.circle(3)
