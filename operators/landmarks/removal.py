@@ -10,10 +10,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 from pydantic import PositiveFloat
 
-from mapstream.operators.landmarks.views import reprojection_errors_px, views_of
+from mapstream.operators.landmarks.views import (
+    T_map_sensor_of,
+    reprojection_errors_px,
+    views_of,
+)
 from mapstream.operators.operator import OperatorConfig
 from mapstream.recordings.maps.columns import BoolArray
 from mapstream.recordings.maps.model import Map
+from mapstream.streams.arrays import FloatArray, IntArray
 
 
 class InvalidConfig(OperatorConfig):
@@ -23,6 +28,8 @@ class InvalidConfig(OperatorConfig):
     """Landmarks behind the camera are invalid at any distance."""
     max_error_m: PositiveFloat = 2.0
     """Of 3D points."""
+    most_baselines: PositiveFloat | None = None
+    """Of points beyond so many baselines only the first camera of a vertex counts; null: all do."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -50,6 +57,8 @@ def remove_invalid_observations(
     p_map = map_.T_map_landmark(landmarks)[:, :3, 3]
     misses_m = np.linalg.norm(views_of(map_, rows).points - p_map, axis=1)
     is_false |= misses_m > config.max_error_m
+    if config.most_baselines is not None:
+        is_false |= _far_pairs(map_, rows, p_map, config.most_baselines)
     landmark = map_.observations.landmark.copy()
     landmark[rows[is_false]] = -1
     loose = replace(map_, observations=replace(map_.observations, landmark=landmark))
@@ -59,6 +68,25 @@ def remove_invalid_observations(
     lost[map_.edges.landmark_b[map_.edges.landmark_b >= 0]] = False
     left, report = without_landmarks(loose, lost)
     return left, replace(report, num_observations=int(is_false.sum()))
+
+
+def _far_pairs(map_: Map, rows: IntArray, p_map: FloatArray, most_baselines: float) -> BoolArray:
+    """Return which observations (N,) see a landmark (N, 3) that an earlier row saw from the same vertex, too far away.
+
+    The calibration of a pair of cameras errs by some tenth of a pixel, always to the same side. Near points hardly
+    notice; of far ones many images would average to a distance that is certain and wrong.
+    """
+    seen = map_.observations
+    order = np.lexsort((rows, seen.landmark[rows], seen.vertex[rows]))
+    pair = np.column_stack([seen.vertex[rows], seen.landmark[rows]])[order]
+    again = np.flatnonzero((pair[1:] == pair[:-1]).all(axis=1)) + 1
+    second, first = order[again], order[again - 1]
+    places = T_map_sensor_of(map_, rows)[:, :3, 3]
+    baselines_m = np.linalg.norm(places[second] - places[first], axis=1)
+    distances_m = np.linalg.norm(p_map[second] - places[second], axis=1)
+    is_far = np.zeros(len(rows), bool)
+    is_far[second[distances_m > most_baselines * baselines_m]] = True
+    return is_far
 
 
 def without_landmarks(map_: Map, goes: BoolArray) -> tuple[Map, RemovalReport]:

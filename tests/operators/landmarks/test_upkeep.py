@@ -18,7 +18,12 @@ from mapstream.operators.landmarks.quality import (
     evaluate_quality,
     reset_quality,
 )
-from mapstream.operators.landmarks.removal import remove_bad_landmarks, remove_invalid_observations
+from mapstream.operators.landmarks.removal import (
+    InvalidConfig,
+    remove_bad_landmarks,
+    remove_invalid_observations,
+)
+from mapstream.operators.landmarks.views import T_map_sensor_of
 from mapstream.recordings.maps.check import check_map
 from mapstream.recordings.maps.model import Map
 from mapstream.recordings.maps.tables import Observations
@@ -151,6 +156,31 @@ def test_E10_observations_that_cannot_be_true_lose_their_landmark() -> None:
     assert np.flatnonzero(left.observations.landmark < 0).tolist() == sorted({5, *expected})
     assert report.num_landmarks == 1
     assert check_map(left) == []
+
+
+def test_E10_of_points_beyond_the_reach_of_a_pair_the_first_camera_counts() -> None:
+    world = World(num_points=40)
+    map_ = world.with_odometry(with_true_landmarks(world, world.map()), noisy=False)
+    seen = map_.observations
+    places = T_map_sensor_of(map_, np.arange(len(seen)))[:, :3, 3]
+    points = map_.T_map_landmark(seen.landmark)[:, :3, 3]
+    expected = []
+    for row in range(len(seen)):
+        beside = np.flatnonzero(
+            (seen.vertex == seen.vertex[row]) & (seen.landmark == seen.landmark[row])
+        )
+        before = beside[beside < row]
+        if len(before):
+            baseline_m = np.linalg.norm(places[row] - places[before[-1]])
+            if np.linalg.norm(points[row] - places[row]) > 20 * baseline_m:
+                expected.append(row)
+
+    left, report = remove_invalid_observations(map_, InvalidConfig(most_baselines=20))
+
+    freed = np.flatnonzero(left.observations.landmark < 0)
+    assert freed.tolist() == expected
+    assert 0 < report.num_observations < len(seen)
+    assert report.num_landmarks == 0
 
 
 def test_E11_merged_landmarks_have_the_observations_of_all() -> None:

@@ -9,6 +9,7 @@ from pydantic import ValidationError
 
 from mapstream.operators.maps.steps import TOOLS, MapStep, MapSteps, MapStepsConfig, prepared
 from mapstream.operators.testing import run_operator
+from mapstream.streams.errors import MapError
 from tests.recordings.made_maps import line_map
 
 pytestmark = pytest.mark.anyio
@@ -30,7 +31,13 @@ async def test_L6_steps_are_done_in_order_and_the_journal_tells_them() -> None:
 
 @pytest.mark.parametrize("tool", TOOLS)
 def test_every_tool_is_there_and_takes_a_map(tool: str) -> None:
-    map_, _ = prepared(MapStep(tool=tool))(line_map(3))
+    """A summary needs landmarks, and says so."""
+    made = prepared(MapStep(tool=tool))
+    if tool == "summarize":
+        with pytest.raises(MapError, match="no landmark has a descriptor"):
+            made(line_map(3))
+        return
+    map_, _ = made(line_map(3))
 
     assert len(map_.vertices) == 3
 
