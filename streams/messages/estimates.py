@@ -170,7 +170,9 @@ class MapPose:
     """Where the robot is in a map that is finished, by its odometry and by what it recognises of the map."""
 
     stamp_ns: int
-    state: Literal["lost", "tracking", "recovered"]  # recovered: this pose ends a time of being lost
+    state: Literal[
+        "lost", "tracking", "recovered"
+    ]  # recovered: this pose ends a time of being lost
     T_map_base: SE3 | None = None  # None while lost
     T_map_odom: SE3 | None = None  # carries the odometry into the map
     covariance: FloatArray | None = None  # (6, 6) of T_map_base
