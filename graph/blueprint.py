@@ -27,6 +27,7 @@ _IN_SPACE = (
     estimates.Submap,
     estimates.LoopReport,
     estimates.MapCorrection,
+    estimates.MapPose,
     Map,
 )
 _PICTURES = (sensors.CameraFrame, sensors.EncodedImage)

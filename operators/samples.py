@@ -12,6 +12,7 @@ from mapstream.streams.messages.estimates import (
     Keyframe,
     LoopReport,
     MapCorrection,
+    MapPose,
     Odometry,
     PointCloud,
     RelativePose,
@@ -27,7 +28,7 @@ from mapstream.streams.messages.sensors import (
     TransformBatch,
     WheelOdometry,
 )
-from mapstream.streams.messages.vision import ImageFeatures, NFrame
+from mapstream.streams.messages.vision import GlobalDescriptor, ImageFeatures, NFrame
 
 PERIOD_NS = 100_000_000
 START_NS = 1_700_000_000_000_000_000
@@ -105,6 +106,12 @@ def _correction(stamp_ns: int, i: int) -> MapCorrection:
     )
 
 
+def _map_pose(stamp_ns: int, i: int) -> MapPose:
+    return MapPose(
+        stamp_ns=stamp_ns, state="tracking", T_map_base=_pose(i), T_map_odom=SE3.identity()
+    )
+
+
 def _imu(stamp_ns: int, _: int) -> ImuBatch:
     stamps_ns = stamp_ns + np.arange(20) * PERIOD_NS // 20
     accel_mps2 = np.tile([0.0, 0.0, 9.81], (20, 1))
@@ -129,6 +136,11 @@ def _features(stamp_ns: int, i: int) -> ImageFeatures:
 
 def _n_frame(stamp_ns: int, i: int) -> NFrame:
     return NFrame(stamp_ns=stamp_ns, features=(_features(stamp_ns, i),))
+
+
+def _descriptor(stamp_ns: int, i: int) -> GlobalDescriptor:
+    vector = np.cos(np.arange(64) + 0.1 * i).astype(np.float32)
+    return GlobalDescriptor(stamp_ns=stamp_ns, kind="vlad", frame="camera", vector=vector)
 
 
 def _laser(stamp_ns: int, _: int) -> LaserScan2D:
@@ -171,6 +183,7 @@ def _png(stamp_ns: int, _: int) -> EncodedImage:
 _MAKERS: dict[object, Callable[[int, int], Any]] = {
     CameraFrame: _frame,
     EncodedImage: _png,
+    GlobalDescriptor: _descriptor,
     GnssFix: _fix,
     ImageFeatures: _features,
     NFrame: _n_frame,
@@ -180,6 +193,7 @@ _MAKERS: dict[object, Callable[[int, int], Any]] = {
     LidarScan: _scan,
     LoopReport: lambda stamp_ns, _: LoopReport(stamp_ns=stamp_ns),
     MapCorrection: _correction,
+    MapPose: _map_pose,
     Odometry: _odometry,
     PointCloud: _cloud,
     Submap: _submap,

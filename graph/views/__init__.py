@@ -20,6 +20,7 @@ from mapstream.graph.views.images import (
     view_encoded_image,
 )
 from mapstream.graph.views.lidar import view_laser_scan, view_lidar_scan, view_point_cloud
+from mapstream.graph.views.localization import view_map_pose
 from mapstream.graph.views.mapping import (
     view_keyframe,
     view_loop_report,
@@ -70,6 +71,7 @@ _BUILT_IN: dict[type, View] = {
     estimates.Submap: view_submap,
     estimates.LoopReport: view_loop_report,
     estimates.MapCorrection: view_map_correction,
+    estimates.MapPose: view_map_pose,
     vision.ImageFeatures: view_image_features,
     vision.NFrame: view_n_frame,
     Map: view_map,

@@ -79,6 +79,8 @@ class Scene:
     corrected: dict[str, tuple[IntArray, FloatArray]] = field(default_factory=dict)  # in map
     submaps: dict[str, tuple[Vertex, SE3]] = field(default_factory=dict)  # by path: what moves it
     loops: dict[tuple[Vertex, Vertex], float] = field(default_factory=dict)  # ends -> switch
+    located: dict[str, tuple[int, SE3]] = field(default_factory=dict)
+    """By output: how often the robot was recovered, and where it was last in the map."""
     tracked: dict[str, dict[str, tuple[int, IntArray, Float32Array]]] = field(default_factory=dict)
     """By kind and camera: stamp, track ids (N,) and places (N, 2) of the newest image."""
     _known: dict[tuple[str, str], Any] = field(default_factory=dict)

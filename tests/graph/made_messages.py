@@ -16,6 +16,7 @@ from mapstream.streams.messages.estimates import (
     LoopCandidate,
     LoopReport,
     MapCorrection,
+    MapPose,
     Odometry,
     PointCloud,
     RelativePose,
@@ -101,6 +102,25 @@ def correction(num_poses: int = 4, shift_m: float = 0.0) -> MapCorrection:
         T_mission_base=poses,
         T_mission_odom=SE3.from_rotation(np.eye(3), (0.0, shift_m, 0.0)),
     )
+
+
+def map_poses() -> list[MapPose]:
+    """A robot that is lost, found, lost again, and recovered elsewhere."""
+    T_map_odom = SE3.from_rotation(np.eye(3), (0.0, 5.0, 0.0))
+    poses = []
+    for step, state in enumerate(["lost", "tracking", "tracking", "lost", "recovered"]):
+        is_lost = state == "lost"
+        poses.append(
+            MapPose(
+                stamp_ns=step * STEP_NS,
+                state=state,  # type: ignore[arg-type]  # one of the literals
+                T_map_base=None if is_lost else T_map_odom @ pose(step),
+                T_map_odom=None if is_lost else T_map_odom,
+                num_inliers=0 if is_lost else 40,
+                verdict="3 matches, which speak of no place" if is_lost else "accepted",
+            )
+        )
+    return poses
 
 
 def loop_report() -> LoopReport:

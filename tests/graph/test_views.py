@@ -115,6 +115,36 @@ def test_P1_odometry_moves_the_robot_and_leaves_a_trail(tmp_path: Path) -> None:
     assert len(trail[-1][0]) == 5
 
 
+def test_P1_the_robot_in_a_finished_map_is_coloured_by_state(tmp_path: Path) -> None:
+    poses = made.map_poses()
+
+    entities = drawn(tmp_path, poses)
+
+    robot = entities["/op/port/robot"]
+    colors = [row[0] for row in values_of(robot, "Boxes3D:colors")]
+    assert len(colors) == 4  # of the first nobody knows where it was
+    assert colors[0] == colors[1] == ACCEPTED
+    assert colors[2] == REFUSED | 0xFF
+    assert colors[3] not in colors[:3]
+    places = np.array(values_of(robot, "Transform3D:translation"))[:, 0]
+    np.testing.assert_allclose(places[2], places[1])  # where it was last
+    np.testing.assert_allclose(places[3], made.pose(4).t + np.array([0, 5, 0]), atol=1e-5)
+    np.testing.assert_allclose(
+        values_of(entities["/frames/odom"], "Transform3D:translation")[-1][0], [0, 5, 0]
+    )
+    assert {"/op/port/way/0/0", "/op/port/way/1/0", "/op/port/recovered/1"} <= set(entities)
+    texts = [row[0] for row in values_of(entities["/op/port/log"], "TextLog:text")]
+    assert texts[0].startswith("lost: 3 matches, which speak of no place")
+    assert texts[4].startswith("recovered: accepted")
+
+
+def test_odometry_that_lies_in_the_map_is_not_moved_again() -> None:
+    scene = Scene(path="op/poses", main_odometry="op/odometry")
+
+    for pose in made.map_poses():
+        assert "/frames/odom" not in {entry.path for entry in view_of(pose)(pose, scene)}
+
+
 def test_a_long_trail_is_drawn_in_stretches(tmp_path: Path) -> None:
     """With a message only its last stretch is logged, so that a run's file grows with its length."""
     entities = drawn(tmp_path, [made.odometry(step) for step in range(250)])
