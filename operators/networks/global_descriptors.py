@@ -72,7 +72,7 @@ class GlobalDescriptors(Operator[Inputs, Outputs]):
             if frame.stamp_ns < self._next_ns.get(frame.frame, frame.stamp_ns):
                 continue
             self._next_ns[frame.frame] = frame.stamp_ns + period_ns
-            image = _rgb(frame)
+            image = rgb(frame)
             if image.min() == image.max():
                 warn(f"images of {frame.frame} of one colour have no descriptor")
                 continue
@@ -98,7 +98,8 @@ class GlobalDescriptors(Operator[Inputs, Outputs]):
         )
 
 
-def _rgb(frame: CameraFrame) -> RgbImage:
+def rgb(frame: CameraFrame) -> RgbImage:
+    """Return an image (H, W, 3) as networks want it."""
     if frame.encoding == "rgb8":
         return frame.image
     if frame.encoding == "bgr8":

@@ -9,6 +9,7 @@ from __future__ import annotations
 import re
 from collections import Counter
 from dataclasses import dataclass
+from functools import partial
 from typing import Literal
 
 import numpy as np
@@ -20,6 +21,7 @@ from mapstream.operators.places.recognition import Found
 from mapstream.operators.places.roc import RocPoint, roc
 from mapstream.operators.places.searching import Compared, SearchConfig, search
 from mapstream.operators.places.views import VertexViews
+from mapstream.operators.places.whole_images import WholeImages, WholeImagesConfig, whole_images
 from mapstream.recordings.maps.build import append_edges
 from mapstream.recordings.maps.model import Map
 from mapstream.recordings.maps.rows import concatenate
@@ -53,6 +55,10 @@ class VisualLoopsConfig(SearchConfig):
     result: Literal["edges", "merge"] = "edges"
     """`merge`: landmarks become one instead, where both missions are anchored; no edge is added."""
     edge: LoopEdgeConfig = Field(default_factory=LoopEdgeConfig)
+    candidates: Literal["local", "global", "both"] = "local"
+    """`local`: matches of keypoints vote for places. `global`: those whose recorded images are most alike as a
+    whole are compared. `both`: these where the votes recognise nothing."""
+    whole_images: WholeImagesConfig = Field(default_factory=WholeImagesConfig)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -95,14 +101,22 @@ class VisualLoopsReport:
 
 
 def find_visual_loops(
-    map_: Map, config: VisualLoopsConfig | None = None
+    map_: Map, config: VisualLoopsConfig | None = None, images: WholeImages | None = None
 ) -> tuple[Map, VisualLoopsReport]:
     """Return the map with its visual loops closed, and what became of each candidate.
 
     Landmarks must be there: `create_landmarks` makes them from tracks.
+
+    Args:
+        map_: The map.
+        config: How loops are found.
+        images: What its images look like, for candidates that are not local; without, they are read again.
+
+    Raises:
+        MapError: If images are asked for and none lie behind the map.
     """
     config = config or VisualLoopsConfig()
-    compared = list(search(map_, config))
+    compared = _compared(map_, config, images)
     found = [(each.vertex, each.recognition.found) for each in compared]
     accepted = [(vertex, place) for vertex, place in found if place is not None]
     changed, num_merged, num_edges = map_, 0, 0
@@ -131,6 +145,14 @@ def find_visual_loops(
         candidates=candidates,
         roc=roc([c.score for c in candidates], [c.verdict == "accepted" for c in candidates]),
     )
+
+
+def _compared(map_: Map, config: VisualLoopsConfig, images: WholeImages | None) -> list[Compared]:
+    if config.candidates == "local":
+        return list(search(map_, config))
+    images = images or whole_images(map_, config.whole_images)
+    propose = partial(images.most_alike, count=config.whole_images.num_vertices)
+    return list(search(map_, config, propose, has_votes=config.candidates == "both"))
 
 
 def loop_edge(map_: Map, vertex: int, place: Found, config: LoopEdgeConfig) -> Edges:

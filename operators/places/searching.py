@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from pydantic import NonNegativeFloat, PositiveInt
@@ -20,6 +21,9 @@ from mapstream.operators.places.views import VertexViews
 from mapstream.recordings.maps.model import Map
 from mapstream.recordings.maps.projections import DescriptorProjection, projections_of
 from mapstream.streams.arrays import FloatArray
+
+Propose = Callable[[int, Collection[int]], Sequence[int]]
+"""Returns which of some vertices are worth a look from a vertex."""
 
 
 class SearchConfig(RecognitionConfig):
@@ -48,12 +52,24 @@ class Search:
 
     A vertex is put among what its own mission is compared with only when the gap is over, so that the nearest
     descriptors are never those of the moment before.
+
+    Args:
+        config: Which are compared.
+        projections: By kind, of the indices.
+        propose: Where to look, too; where matches alone say without.
+        has_votes: Matches vote for places, and proposals come in where they recognise none; else proposals alone.
     """
 
     def __init__(
-        self, config: SearchConfig, projections: Mapping[str, DescriptorProjection] | None = None
+        self,
+        config: SearchConfig,
+        projections: Mapping[str, DescriptorProjection] | None = None,
+        propose: Propose | None = None,
+        *,
+        has_votes: bool = True,
     ) -> None:
         self._config, self._projections = config, dict(projections or {})
+        self._propose, self._has_votes = propose, has_votes
         self._databases: dict[int, PlaceDatabase] = {}  # by mission, or one of all
         self._waiting: dict[int, deque[int]] = {}  # by mission: vertices that are not put there yet
 
@@ -74,9 +90,21 @@ class Search:
         self._waiting.setdefault(mission, deque()).append(vertex)
         if not len(database):
             return None
-        seed = seed_of(map_.vertices.id[vertex].tobytes())
-        found = recognize(views.at(vertex), database, landmarks_map, self._config, seed=seed)
-        return Compared(vertex, found)
+        look = partial(
+            recognize,
+            views.at(vertex),
+            database,
+            landmarks_map,
+            self._config,
+            seed=seed_of(map_.vertices.id[vertex].tobytes()),
+        )
+        if self._propose is None:
+            return Compared(vertex, look())
+        voted = look() if self._has_votes else None
+        if voted is not None and voted.found is not None:
+            return Compared(vertex, voted)
+        proposed = look(vertices=self._propose(vertex, database.num_descriptors_of))
+        return Compared(vertex, proposed if voted is None else _both(voted, proposed))
 
     def _database(self, mission: int) -> PlaceDatabase:
         key = -1 if self._config.between else mission
@@ -85,11 +113,21 @@ class Search:
         return self._databases[key]
 
 
-def search(map_: Map, config: SearchConfig) -> Iterator[Compared]:
-    """Yield what comes of comparing the vertices of a map with the past, mission by mission."""
+def _both(a: Recognition, b: Recognition) -> Recognition:
+    return Recognition(
+        num_matches=a.num_matches + b.num_matches,
+        candidates=(*a.candidates, *b.candidates),
+        found=b.found,
+    )
+
+
+def search(
+    map_: Map, config: SearchConfig, propose: Propose | None = None, *, has_votes: bool = True
+) -> Iterator[Compared]:
+    """Yield what comes of comparing the vertices of a map with the past, mission by mission; see `Search`."""
     landmarks_map = landmark_positions(map_)
     views = VertexViews(map_, config.kinds)
-    searching = Search(config, projections_of(map_, "index"))
+    searching = Search(config, projections_of(map_, "index"), propose, has_votes=has_votes)
     for mission in range(len(map_.missions)):
         for vertex in map_.vertices_of(mission)[:: config.every].tolist():
             compared = searching.compare(map_, vertex, views, landmarks_map)
