@@ -22,7 +22,8 @@ class MapPlaces:
     def __init__(self, map_: Map, config: RecognitionConfig) -> None:
         self._config = config
         self._landmarks_map = landmark_positions(map_)
-        self._database = known_places(map_, config, VertexViews(map_, config.kinds))
+        views = VertexViews(map_, config.kinds)
+        self._database = known_places(map_, config, views)
         self.kinds = sorted(set(map_.landmarks.kind.tolist()))
         if not len(self._database):
             kinds = ", ".join(self.kinds) or "none"
@@ -30,6 +31,8 @@ class MapPlaces:
                 "the map has no landmark with a descriptor in an anchored mission, so nothing can be"
                 f" recognised in it; kinds of its landmarks: {kinds}; `create_landmarks` makes them from tracks"
             )
+        # The first look imports what takes a second: no frame of a robot that drives shall wait for it.
+        self.recognize(views.at(next(iter(self._database.num_descriptors_of))), seed=0)
 
     def recognize(self, views: Sequence[View], seed: int) -> Recognition:
         """Return where a frame was taken, if the map tells."""

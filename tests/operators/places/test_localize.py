@@ -1,5 +1,7 @@
 """Localisation in a map whose truth is known."""
 
+import subprocess
+import sys
 from itertools import pairwise
 from pathlib import Path
 
@@ -143,6 +145,25 @@ async def test_localising_leaves_the_map_as_it_is(folder: Path) -> None:
     await run_operator(Localize(LocalizeConfig(map=folder)), n_frames=[_frame(_drive(1)[0], 0)])
 
     assert load_map(folder).digest() == before
+
+
+@pytest.mark.slow
+def test_H13_the_first_frame_does_not_wait_for_imports(folder: Path) -> None:
+    script = f"""
+import sys
+from pathlib import Path
+from mapstream.operators.places.map_places import MapPlaces
+from mapstream.operators.places.recognition import RecognitionConfig
+from mapstream.recordings.maps import load_map
+MapPlaces(load_map(Path({str(folder)!r})), RecognitionConfig())
+print("scipy.stats" in sys.modules, "scipy.sparse.csgraph" in sys.modules)
+"""
+
+    done = subprocess.run(
+        [sys.executable, "-c", script], capture_output=True, text=True, check=True
+    )
+
+    assert done.stdout.split() == ["True", "True"]
 
 
 async def test_a_map_without_descriptors_is_refused(tmp_path: Path) -> None:
