@@ -45,8 +45,15 @@ def _next_port(ports: Sequence[Port[Any]]) -> Port[Any]:
 class Merge(Join[tuple[int, Any]]):
     """See `merge`."""
 
-    def __init__(self, receivers: Sequence[Receiver[Any]], *, keeps_late: bool = False) -> None:
+    def __init__(
+        self,
+        receivers: Sequence[Receiver[Any]],
+        *,
+        keeps_late: bool = False,
+        delays_ns: Sequence[int] = (),
+    ) -> None:
         super().__init__(receivers)
+        self._delays_ns = delays_ns or [0] * len(self.ports)
         if keeps_late:
             for port in self.ports:
                 port.late = []
@@ -56,7 +63,7 @@ class Merge(Join[tuple[int, Any]]):
             for port in self.ports:
                 if port.late:
                     return port.index, port.late.pop(0)
-            port = _next_port(self.ports)
+            port = min(self.ports, key=lambda port: port.next_ns + self._delays_ns[port.index])
             if port.next_ns == END:
                 return None
             message = port.first
@@ -179,16 +186,22 @@ class Approximate(Join[tuple[Any, ...]]):
 @overload
 def merge(receiver1: Receiver[M1], /) -> Join[tuple[int, M1]]: ...
 @overload
-def merge(receiver1: Receiver[M1], receiver2: Receiver[M2], /) -> Join[tuple[int, M1 | M2]]: ...
+def merge(
+    receiver1: Receiver[M1], receiver2: Receiver[M2], /, *, delays_ns: Sequence[int] = ...
+) -> Join[tuple[int, M1 | M2]]: ...
 @overload
 def merge(*receivers: Receiver[Any], keeps_late: bool = ...) -> Join[tuple[int, Any]]: ...
-def merge(*receivers: Receiver[Any], keeps_late: bool = False) -> Join[Any]:
+def merge(
+    *receivers: Receiver[Any], keeps_late: bool = False, delays_ns: Sequence[int] = ()
+) -> Join[Any]:
     """Join: (port index, message) of all receivers in stamp order, equal stamps in port order.
 
     It ends when all have ended; one that ended no longer holds the others back.
     A message behind its port's bound is dropped, or with `keeps_late` comes as soon as it is seen.
+    With `delays_ns`, one for each receiver, messages come as if their stamps were so much newer: what takes long
+    to be made does not hold the others back.
     """
-    return Merge(receivers, keeps_late=keeps_late)
+    return Merge(receivers, keeps_late=keeps_late, delays_ns=delays_ns)
 
 
 @overload

@@ -121,6 +121,30 @@ async def _stamps(join: Join[Any]) -> list[tuple[Any, ...]]:
 
 
 @pytest.mark.anyio
+async def test_merge_waits_for_a_delayed_port_no_longer_than_the_delay() -> None:
+    late: Channel[Tick] = Channel("late", Limits())
+    late.advance(4)  # nothing older follows, and nothing is there yet
+    join = merge(_queued(1, 5, 9, 13), Receiver(late), delays_ns=(0, 6))
+    stream = aiter(join)
+
+    soon = [(await anext(stream))[1].stamp_ns for _ in range(3)]
+    with anyio.move_on_after(0.01) as waiting:
+        await anext(stream)
+
+    assert soon == [1, 5, 9]
+    assert waiting.cancelled_caught  # 13 may come after a message of 4 to 6
+
+
+@pytest.mark.anyio
+async def test_merge_orders_by_stamps_and_delays() -> None:
+    join = merge(_queued(1, 5, 9, 13), _queued(0, 4, 8), delays_ns=(0, 6))
+
+    found = [(port, tick.stamp_ns) async for port, tick in join]
+
+    assert found == [(0, 1), (0, 5), (1, 0), (0, 9), (1, 4), (0, 13), (1, 8)]
+
+
+@pytest.mark.anyio
 async def test_exact_pairs_equal_stamps_and_counts_the_rest() -> None:
     join = exact(_queued(1, 2, 3, 5, name="left"), _queued(2, 3, 4, 5, 5, name="right"))
 
