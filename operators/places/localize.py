@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from bisect import bisect_left
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar
@@ -28,6 +30,8 @@ class LocalizeConfig(OperatorConfig):
     """The folder of the map, or of its summary."""
     period_s: NonNegativeFloat = 0.5
     """Between two frames that are compared with the map; 0: all are."""
+    late_s: NonNegativeFloat = 0.2
+    """So long after its stamp a frame corrects the pose: poses do not wait for what cameras take to be understood."""
     recognition: RecognitionConfig = Field(default_factory=RecognitionConfig)
     drift: DriftConfig = Field(default_factory=DriftConfig)
 
@@ -61,7 +65,8 @@ class Localize(Operator[Inputs, Outputs]):
         self._config = config
         self._drift = Drift(config.drift)
         self._places: MapPlaces | None = None
-        self._before: Odometry | None = None
+        self._late_ns = round(config.late_s * 1e9)
+        self._moves: list[Odometry] = []  # as far back as frames may be late
         self._compared_ns: int | None = None
         self._waiting: list[NFrame] = []  # for the odometry of their time
         self._has_tracked = self._was_tracking = False
@@ -73,7 +78,9 @@ class Localize(Operator[Inputs, Outputs]):
                 if self._is_due(frame):
                     await self._send(outputs, await offload(self.locate, frame))
             return
-        async for _, message in merge(inputs.odometry, inputs.n_frames):
+        async for _, message in merge(
+            inputs.odometry, inputs.n_frames, delays_ns=(0, self._late_ns)
+        ):
             if isinstance(message, Odometry):
                 await self._send(outputs, await offload(self.follow, message))
             elif self._is_due(message):
@@ -117,7 +124,7 @@ class Localize(Operator[Inputs, Outputs]):
 
     def follow(self, odometry: Odometry) -> MapPose:
         """Return where the robot is at this moment of its odometry, after the frames until then."""
-        before = self._before or odometry
+        self._moves.append(odometry)
         self._drift.move(odometry.T_odom_base)
         num_inliers, verdict = 0, ""
         for frame in self._waiting:
@@ -126,11 +133,12 @@ class Localize(Operator[Inputs, Outputs]):
             if recognition.found is not None:
                 num_inliers = len(recognition.found.inliers)
                 pose = recognition.found.consensus.pose
-                T_odom_base = _between(before, odometry, frame.stamp_ns)
+                T_odom_base = _at(self._moves, frame.stamp_ns)
                 fix = Fix(frame.stamp_ns, pose.T_map_base, pose.covariance, T_odom_base)
                 self._drift.correct(fix)
         self._waiting.clear()
-        self._before = odometry
+        while len(self._moves) > 1 and self._moves[1].stamp_ns <= odometry.stamp_ns - self._late_ns:
+            del self._moves[0]
         T_map_odom = self._drift.T_map_odom(odometry.stamp_ns)
         is_back = T_map_odom is not None and self._has_tracked and not self._was_tracking
         self._was_tracking = T_map_odom is not None
@@ -156,7 +164,9 @@ class Localize(Operator[Inputs, Outputs]):
         return places.recognize(views, seed=frame.stamp_ns % 2**32)
 
 
-def _between(a: Odometry, b: Odometry, stamp_ns: int) -> SE3:
-    """Return the odometry's pose at a moment between two messages."""
+def _at(moves: Sequence[Odometry], stamp_ns: int) -> SE3:
+    """Return the odometry's pose at a moment; beyond its ends, that of the nearest message."""
+    after = bisect_left(moves[:-1], stamp_ns, key=lambda move: move.stamp_ns)
+    a, b = moves[max(after - 1, 0)], moves[after]
     fraction = (stamp_ns - a.stamp_ns) / max(b.stamp_ns - a.stamp_ns, 1)
     return a.T_odom_base.interpolate(b.T_odom_base, min(max(fraction, 0.0), 1.0))

@@ -176,7 +176,7 @@ class MapPose:
     T_map_base: SE3 | None = None  # None while lost
     T_map_odom: SE3 | None = None  # carries the odometry into the map
     covariance: FloatArray | None = None  # (6, 6) of T_map_base
-    num_inliers: int = 0  # of the frame of this stamp, if one was compared with the map
+    num_inliers: int = 0  # of the frame that was compared with the map since the pose before
     verdict: str = ""  # on that frame: accepted, or why not
 
     def __post_init__(self) -> None:

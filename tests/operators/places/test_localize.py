@@ -74,23 +74,27 @@ async def test_H12_frames_alone_are_found_in_the_map(folder: Path) -> None:
 
 
 @pytest.mark.slow
-async def test_H13_odometry_that_drifts_is_held_in_the_map(folder: Path) -> None:
+@pytest.mark.parametrize(("late_s", "first", "most_m"), [(0.0, 5, 0.12), (0.6, 7, 0.18)])
+async def test_H13_odometry_that_drifts_is_held_in_the_map(
+    folder: Path, late_s: float, first: int, most_m: float
+) -> None:
+    """Frames that come later leave as much more drift: 0.1 m/s."""
     truth = _drive(40)
     odometry = _odometry(made_maps.drifted([truth[0].inverse() @ pose for pose in truth]))
     frames = [_frame(pose, k) for k, pose in enumerate(truth)]
 
     out = await run_operator(
-        Localize(LocalizeConfig(map=folder)), odometry=odometry, n_frames=frames
+        Localize(LocalizeConfig(map=folder, late_s=late_s)), odometry=odometry, n_frames=frames
     )
 
     poses: list[MapPose] = out["poses"]
     found = [k for k, pose in enumerate(poses) if pose.T_map_base is not None]
     assert [pose.stamp_ns for pose in poses] == [o.stamp_ns for o in odometry]
-    assert found[0] <= 5  # the third fix, half a second apart
+    assert found[0] <= first  # the third fix, half a second apart
     assert found == list(range(found[0], 40))
     assert {pose.state for pose in poses[found[0] :]} == {"tracking"}
     errors = [_error_m(poses[k], truth[k]) for k in found]
-    assert max(errors) < 0.12  # the odometry drifts by a metre
+    assert max(errors) < most_m  # the odometry drifts by a metre
     last = poses[-1]
     assert last.covariance is not None
     assert 0 < np.sqrt(last.covariance[3, 3]) < 0.1
