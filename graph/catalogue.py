@@ -59,6 +59,7 @@ BUILT_IN = {
     "orb": "mapstream.operators.features.features:Orb",
     "rectify": "mapstream.operators.images.rectify:Rectify",
     "resize": "mapstream.operators.images.resize:Resize",
+    "rgbd_odometry": "mapstream.operators.odometry.rgbd.rgbd_odometry:RgbdOdometry",
     "submap_builder": "mapstream.operators.submaps.submap_builder:SubmapBuilder",
     "superpoint": "mapstream.operators.networks.superpoint:SuperPoint",
     "track_filter": "mapstream.operators.tracking.track_filter:TrackFilter",

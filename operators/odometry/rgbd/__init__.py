@@ -1,0 +1,1 @@
+"""Odometry from the shape of what a colour and depth camera sees."""
