@@ -30,7 +30,7 @@ class LocalizeConfig(OperatorConfig):
     """The folder of the map, or of its summary."""
     period_s: NonNegativeFloat = 0.5
     """Between two frames that are compared with the map; 0: all are."""
-    late_s: NonNegativeFloat = 0.2
+    late_s: NonNegativeFloat = 0.5
     """So long after its stamp a frame corrects the pose: poses do not wait for what cameras take to be understood."""
     recognition: RecognitionConfig = Field(default_factory=RecognitionConfig)
     drift: DriftConfig = Field(default_factory=DriftConfig)
