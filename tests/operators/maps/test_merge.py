@@ -12,6 +12,7 @@ from mapstream.operators.maps.merge import MergeConfig, merge
 from mapstream.recordings.maps import Map, check_map
 from mapstream.recordings.maps.build import add_edges, anchored, append_edges, with_poses
 from mapstream.recordings.maps.combine import select_missions
+from mapstream.recordings.maps.features import descriptors_of
 from mapstream.recordings.maps.ids import derived_id, id_array
 from mapstream.recordings.maps.order import in_canonical_order
 from mapstream.recordings.maps.tables import Edges, Frames
@@ -19,6 +20,7 @@ from mapstream.streams.errors import MapError
 from mapstream.streams.geometry import SE3
 from mapstream.streams.messages.estimates import RelativePose
 from tests.recordings.made_maps import COVARIANCE, MISSION, OTHER_MISSION, full_map, line_map
+from tests.recordings.test_map_features import features, map_of
 
 THIRD = "b1" * 16
 
@@ -173,6 +175,23 @@ def test_M5_parts_of_a_mission_join_to_the_uncut_one_in_any_order(seed: int) -> 
         ),
     )
     assert at_rest.digest() == in_canonical_order(whole).digest()
+
+
+def test_M5_tracks_go_on_across_the_cuts() -> None:
+    """Keypoints at a shared vertex are there once, with their tracks and descriptors."""
+    whole = map_of([(features(i, "orb", 3), features(i, "sift", 2)) for i in range(7)])
+    parts = [part(whole, first, last) for first, last in ((0, 2), (2, 5), (5, 6))]
+
+    together, _ = merge([parts[at] for at in (1, 2, 0)])
+
+    assert check_map(together) == []
+    ordered = in_canonical_order(whole)
+    moved = ordered.vertices.T_mission_base - together.vertices.T_mission_base
+    assert np.abs(moved).max() < 1e-12
+    assert replace(together, vertices=ordered.vertices).digest() == ordered.digest()
+    rows = np.flatnonzero(together.observations.kind == "orb")
+    expected = descriptors_of(whole, np.flatnonzero(whole.observations.kind == "orb"))
+    np.testing.assert_array_equal(descriptors_of(together, rows), expected)
 
 
 def test_M5_a_longer_map_of_the_same_mission_adds_what_is_new() -> None:
