@@ -46,6 +46,7 @@ BUILT_IN = {
     "klt": "mapstream.operators.tracking.klt:Klt",
     "lidar_loops": "mapstream.operators.lidar.loops:LidarLoops",
     "localize": "mapstream.operators.places.localize:Localize",
+    "map_overlay": "mapstream.operators.images.map_overlay:MapOverlay",
     "map_steps": "mapstream.operators.maps.steps:MapSteps",
     "map_store": "mapstream.operators.sinks.map_store:MapStore",
     "mcap": "mapstream.operators.sources.mcap:McapSource",
