@@ -19,13 +19,12 @@ from mapstream.recordings.g2o_text import (
     format_g2o,
     parse_g2o,
 )
-from mapstream.recordings.maps.columns import BoolArray
 from mapstream.recordings.maps.edge_kinds import RELATIVE_KINDS
 from mapstream.recordings.maps.folder import write_whole
 from mapstream.recordings.maps.model import Map
 from mapstream.recordings.maps.tables import Edges
 from mapstream.recordings.pose_graph import ROBOT_SHIFT, PoseGraph, map_of, robots_of
-from mapstream.streams.arrays import FloatArray, IntArray
+from mapstream.streams.arrays import BoolArray, FloatArray, IntArray
 from mapstream.streams.errors import RecordingError
 
 

@@ -16,8 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
-from mapstream.recordings.maps.columns import BoolArray
-from mapstream.streams.arrays import FloatArray, IntArray
+from mapstream.streams.arrays import BoolArray, FloatArray, IntArray
 from mapstream.streams.errors import RecordingError
 from mapstream.streams.geometry import quat_xyzw_from_rotation, rotation_from_quat_xyzw
 

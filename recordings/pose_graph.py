@@ -14,12 +14,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from mapstream.recordings.maps.build import append_edges, new_mission
-from mapstream.recordings.maps.columns import BoolArray
 from mapstream.recordings.maps.ids import mission_id
 from mapstream.recordings.maps.model import Map, vertex_ids
 from mapstream.recordings.maps.rows import concatenate
 from mapstream.recordings.maps.tables import Edges, Vertices
-from mapstream.streams.arrays import FloatArray, IntArray
+from mapstream.streams.arrays import BoolArray, FloatArray, IntArray
 from mapstream.streams.errors import RecordingError
 from mapstream.streams.geometry import invert
 

@@ -39,8 +39,8 @@ from mapstream.operators.estimation.states import Values, with_solution
 from mapstream.operators.estimation.vision.bundle import FAMILIES
 from mapstream.operators.estimation.vision.bundle_solver import bundle_solver
 from mapstream.operators.estimation.vision.judging import judged, without_outliers
-from mapstream.recordings.maps.columns import BoolArray
 from mapstream.recordings.maps.model import Map
+from mapstream.streams.arrays import BoolArray
 from mapstream.streams.errors import EstimationError
 
 __all__ = ["OptimizationReport", "OptimizeConfig", "optimize_map"]

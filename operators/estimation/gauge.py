@@ -8,9 +8,8 @@ import numpy as np
 from mapstream.operators.estimation.fixing import fixed
 from mapstream.operators.estimation.keys import variable_of
 from mapstream.operators.estimation.noise import Factor
-from mapstream.recordings.maps.columns import BoolArray
 from mapstream.recordings.maps.model import Map
-from mapstream.streams.arrays import FloatArray, IntArray
+from mapstream.streams.arrays import BoolArray, FloatArray, IntArray
 
 _LEVEL_KINDS = ("imu", "gravity")  # they know where up is
 _TIGHT = 1e4  # per rad and per m; it holds what nothing else does, so it costs nothing

@@ -23,9 +23,8 @@ from mapstream.operators.estimation.solvers import Graph
 from mapstream.operators.estimation.states import Values, initial_values
 from mapstream.operators.estimation.vision.bundle import Bundle, make_bundle
 from mapstream.operators.estimation.vision.camera_states import camera_priors
-from mapstream.recordings.maps.columns import BoolArray
 from mapstream.recordings.maps.model import Map
-from mapstream.streams.arrays import FloatArray, IntArray
+from mapstream.streams.arrays import BoolArray, FloatArray, IntArray
 
 _RELATIVE = ("odometry", "wheel", "registration", "motion_model", "loop")  # need no priors
 _LOSSES: dict[str, str] = {

@@ -15,8 +15,7 @@ import numpy as np
 from mapstream.operators.estimation.outliers.consistency import adjoint
 from mapstream.operators.estimation.solvers import Graph, Limits, Solved
 from mapstream.operators.estimation.states import Values
-from mapstream.recordings.maps.columns import BoolArray
-from mapstream.streams.arrays import FloatArray, IntArray
+from mapstream.streams.arrays import BoolArray, FloatArray, IntArray
 from mapstream.streams.errors import EstimationError
 from mapstream.streams.geometry import hat, invert, se3_exp, se3_log
 

@@ -6,14 +6,12 @@ from collections.abc import Mapping
 from typing import Annotated, Any
 
 import numpy as np
-import numpy.typing as npt
 from pydantic import Field, PositiveFloat
 
 from mapstream.operators.operator import OperatorConfig
-from mapstream.streams.arrays import FloatArray
+from mapstream.streams.arrays import BoolArray, FloatArray
 from mapstream.streams.sensors import ImuSensor
 
-BoolArray = npt.NDArray[np.bool_]
 _Seven = Annotated[tuple[float, ...], Field(min_length=7, max_length=7)]
 
 

@@ -12,12 +12,11 @@ import numpy as np
 
 from mapstream.operators.landmarks.locating import FOUND, LocateConfig, Located, locate
 from mapstream.operators.landmarks.sensors import numbered
-from mapstream.recordings.maps.columns import BoolArray
 from mapstream.recordings.maps.ids import derived_id, id_array
 from mapstream.recordings.maps.model import Map
 from mapstream.recordings.maps.rows import concatenate
 from mapstream.recordings.maps.tables import Landmarks
-from mapstream.streams.arrays import FloatArray, IntArray
+from mapstream.streams.arrays import BoolArray, FloatArray, IntArray
 from mapstream.streams.geometry import invert
 
 

@@ -13,9 +13,9 @@ from pydantic import Field, PositiveFloat, PositiveInt
 from mapstream.operators.landmarks.triangulation import Points, Rays, group_sums, triangulate
 from mapstream.operators.landmarks.views import Views, views_of
 from mapstream.operators.operator import OperatorConfig
-from mapstream.recordings.maps.columns import BoolArray, TextArray
+from mapstream.recordings.maps.columns import TextArray
 from mapstream.recordings.maps.model import Map
-from mapstream.streams.arrays import FloatArray, IntArray
+from mapstream.streams.arrays import BoolArray, FloatArray, IntArray
 
 FOUND = "found"
 REASONS = ("too few views", "too little parallax", "behind a camera", "rays do not meet")

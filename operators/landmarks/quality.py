@@ -18,9 +18,8 @@ from mapstream.operators.landmarks.views import (
     views_of,
 )
 from mapstream.operators.operator import OperatorConfig
-from mapstream.recordings.maps.columns import BoolArray
 from mapstream.recordings.maps.model import Map
-from mapstream.streams.arrays import FloatArray, IntArray
+from mapstream.streams.arrays import BoolArray, FloatArray, IntArray
 
 
 class RayQuality(OperatorConfig):

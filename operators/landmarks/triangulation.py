@@ -11,8 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mapstream.recordings.maps.columns import BoolArray
-from mapstream.streams.arrays import FloatArray, IntArray
+from mapstream.streams.arrays import BoolArray, FloatArray, IntArray
 
 _ITERATIONS = 15
 _CONVERGED = 1e-10  # of the distance

@@ -13,9 +13,8 @@ import numpy as np
 from mapstream.operators.landmarks.motion import Motion, moments
 from mapstream.operators.landmarks.sensors import T_base_sensor_of, all_cameras, sensors_of
 from mapstream.recordings.maps.cameras import Camera
-from mapstream.recordings.maps.columns import BoolArray
 from mapstream.recordings.maps.model import Map
-from mapstream.streams.arrays import FloatArray, IntArray
+from mapstream.streams.arrays import BoolArray, FloatArray, IntArray
 from mapstream.streams.camera_models import project, unproject
 
 POINT_SIGMA_M = 0.05

@@ -9,9 +9,8 @@ from pydantic import Field, NonNegativeFloat, PositiveFloat
 
 from mapstream.operators.maps.loops import touches
 from mapstream.operators.operator import OperatorConfig
-from mapstream.recordings.maps.columns import BoolArray
 from mapstream.recordings.maps.model import Map
-from mapstream.streams.arrays import IntArray
+from mapstream.streams.arrays import BoolArray, IntArray
 from mapstream.streams.errors import MapError
 from mapstream.streams.geometry import se3_exp
 

@@ -16,10 +16,9 @@ from mapstream.operators.landmarks.covisibility import points_of
 from mapstream.operators.maps.landmark_homes import without_vertices
 from mapstream.operators.maps.linking import linked
 from mapstream.operators.operator import OperatorConfig
-from mapstream.recordings.maps.columns import BoolArray
 from mapstream.recordings.maps.edge_kinds import MOTION_KINDS
 from mapstream.recordings.maps.model import Map
-from mapstream.streams.arrays import IntArray
+from mapstream.streams.arrays import BoolArray, IntArray
 from mapstream.streams.geometry import invert, so3_log
 
 

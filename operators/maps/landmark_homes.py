@@ -6,10 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from mapstream.recordings.maps.columns import BoolArray
 from mapstream.recordings.maps.model import Map
 from mapstream.recordings.maps.tables import Landmarks
-from mapstream.streams.arrays import IntArray
+from mapstream.streams.arrays import BoolArray, IntArray
 from mapstream.streams.geometry import (
     invert,
     quat_xyzw_from_rotation,

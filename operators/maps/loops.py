@@ -13,8 +13,8 @@ import numpy as np
 from mapstream.operators.maps.external_loops import End, edge_between, end_at
 from mapstream.operators.maps.missions import find_mission
 from mapstream.recordings.maps.build import add_edges
-from mapstream.recordings.maps.columns import BoolArray
 from mapstream.recordings.maps.model import Map
+from mapstream.streams.arrays import BoolArray
 from mapstream.streams.errors import MapError
 from mapstream.streams.messages.estimates import RelativePose
 from mapstream.streams.trajectory import Trajectory

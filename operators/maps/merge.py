@@ -14,14 +14,14 @@ import numpy as np
 
 from mapstream.operators.maps.joining import NoCommonVertexError, following
 from mapstream.operators.operator import OperatorConfig
-from mapstream.recordings.maps.columns import BoolArray, IdArray, references_of
+from mapstream.recordings.maps.columns import IdArray, references_of
 from mapstream.recordings.maps.combine import select_missions
 from mapstream.recordings.maps.ids import as_keys
 from mapstream.recordings.maps.model import TABLES, Map, from_tables
 from mapstream.recordings.maps.order import in_canonical_order
 from mapstream.recordings.maps.rows import concatenate, shifted, table_digest
 from mapstream.recordings.maps.tables import Frames, Journal, Projections
-from mapstream.streams.arrays import IntArray
+from mapstream.streams.arrays import BoolArray, IntArray
 from mapstream.streams.errors import MapError
 from mapstream.streams.geometry import invert
 

@@ -8,9 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from mapstream.recordings.maps.cameras import Camera
-from mapstream.recordings.maps.columns import BoolArray
 from mapstream.recordings.maps.model import Map
-from mapstream.streams.arrays import FloatArray, IntArray
+from mapstream.streams.arrays import BoolArray, FloatArray, IntArray
 from mapstream.streams.camera_models import project
 from mapstream.streams.geometry import SE3
 

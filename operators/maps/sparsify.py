@@ -14,9 +14,8 @@ from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveInt
 
 from mapstream.operators.landmarks.removal import without_landmarks
 from mapstream.operators.operator import OperatorConfig
-from mapstream.recordings.maps.columns import BoolArray
 from mapstream.recordings.maps.model import Map
-from mapstream.streams.arrays import FloatArray, IntArray
+from mapstream.streams.arrays import BoolArray, FloatArray, IntArray
 from mapstream.streams.errors import MapError
 
 if TYPE_CHECKING:

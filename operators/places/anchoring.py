@@ -17,10 +17,9 @@ from mapstream.operators.places.recognition import RecognitionConfig, recognize,
 from mapstream.operators.places.searching import landmark_positions
 from mapstream.operators.places.views import VertexViews
 from mapstream.recordings.maps.build import anchored
-from mapstream.recordings.maps.columns import BoolArray
 from mapstream.recordings.maps.model import Map
 from mapstream.recordings.maps.projections import projections_of
-from mapstream.streams.arrays import FloatArray
+from mapstream.streams.arrays import BoolArray, FloatArray
 from mapstream.streams.geometry import SE3, invert, se3_exp, se3_log, so3_log
 
 _MEANS = 10  # steps towards the mean of poses

@@ -17,10 +17,9 @@ from mapstream.operators.places.indices.index import (
     make_index,
 )
 from mapstream.operators.places.views import View
-from mapstream.recordings.maps.columns import BoolArray
 from mapstream.recordings.maps.model import Map
 from mapstream.recordings.maps.projections import DescriptorProjection
-from mapstream.streams.arrays import Float32Array, FloatArray, IntArray
+from mapstream.streams.arrays import BoolArray, Float32Array, FloatArray, IntArray
 
 
 class LookConfig(IndexConfig):

@@ -15,11 +15,10 @@ from mapstream.operators.maps.keyframing import KeyframingConfig, keyframe
 from mapstream.operators.maps.sparsify import SparsifyConfig, sparsify
 from mapstream.operators.operator import OperatorConfig
 from mapstream.recordings.maps.build import append_edges
-from mapstream.recordings.maps.columns import BoolArray
 from mapstream.recordings.maps.features import descriptor_block
 from mapstream.recordings.maps.model import Map
 from mapstream.recordings.maps.tables import Edges, Observations, Resources
-from mapstream.streams.arrays import IntArray
+from mapstream.streams.arrays import BoolArray, IntArray
 from mapstream.streams.errors import MapError
 from mapstream.streams.geometry import invert
 

@@ -13,7 +13,6 @@ import numpy.typing as npt
 from mapstream.streams.arrays import frozen
 
 IdArray = npt.NDArray[np.uint8]
-BoolArray = npt.NDArray[np.bool_]
 TextArray = npt.NDArray[np.object_]  # of str
 BytesArray = npt.NDArray[np.object_]  # of bytes
 

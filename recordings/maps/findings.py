@@ -7,9 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mapstream.recordings.maps.columns import BoolArray
 from mapstream.recordings.maps.model import Map
-from mapstream.streams.arrays import IntArray
+from mapstream.streams.arrays import BoolArray, IntArray
 
 Sentence = str | Callable[[int], str]  # one for all rows, or made for a row
 

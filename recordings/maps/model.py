@@ -14,7 +14,7 @@ from typing import Any, cast
 import numpy as np
 import numpy.typing as npt
 
-from mapstream.recordings.maps.columns import BoolArray, Table
+from mapstream.recordings.maps.columns import Table
 from mapstream.recordings.maps.ids import as_keys, id_array, id_bytes, vertex_id
 from mapstream.recordings.maps.rows import select, table_digest
 from mapstream.recordings.maps.tables import (
@@ -30,7 +30,7 @@ from mapstream.recordings.maps.tables import (
     Resources,
     Vertices,
 )
-from mapstream.streams.arrays import FloatArray, IntArray
+from mapstream.streams.arrays import BoolArray, FloatArray, IntArray
 from mapstream.streams.errors import MapError
 from mapstream.streams.geometry import rotation_from_quat_xyzw
 from mapstream.streams.trajectory import Trajectory

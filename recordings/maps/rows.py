@@ -10,15 +10,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from mapstream.recordings.maps.columns import (
-    BoolArray,
-    Column,
-    Table,
-    TableT,
-    columns_of,
-    references_of,
-)
-from mapstream.streams.arrays import IntArray
+from mapstream.recordings.maps.columns import Column, Table, TableT, columns_of, references_of
+from mapstream.streams.arrays import BoolArray, IntArray
 
 
 def take(table: TableT, rows: npt.NDArray[np.integer[Any]] | BoolArray) -> TableT:

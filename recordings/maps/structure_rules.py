@@ -9,11 +9,11 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from mapstream.recordings.maps.columns import BoolArray, IdArray, columns_of, references_of
+from mapstream.recordings.maps.columns import IdArray, columns_of, references_of
 from mapstream.recordings.maps.findings import Finding, Rule, where
 from mapstream.recordings.maps.ids import as_keys, id_array, vertex_id
 from mapstream.recordings.maps.model import Map
-from mapstream.streams.arrays import IntArray
+from mapstream.streams.arrays import BoolArray, IntArray
 
 _OF_ONE_MISSION = ["imu", "odometry", "wheel", "motion_model"]
 

@@ -16,15 +16,8 @@ from typing import ClassVar
 
 import numpy as np
 
-from mapstream.recordings.maps.columns import (
-    BoolArray,
-    BytesArray,
-    IdArray,
-    Table,
-    TextArray,
-    column,
-)
-from mapstream.streams.arrays import Float32Array, FloatArray, IntArray
+from mapstream.recordings.maps.columns import BytesArray, IdArray, Table, TextArray, column
+from mapstream.streams.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from mapstream.streams.geometry import SE3
 
 _NAN = float("nan")

@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from mapstream.recordings.maps.columns import BoolArray, TextArray, columns_of
+from mapstream.recordings.maps.columns import TextArray, columns_of
 from mapstream.recordings.maps.findings import Finding, Rule, where
 from mapstream.recordings.maps.model import Map
-from mapstream.streams.arrays import FloatArray
+from mapstream.streams.arrays import BoolArray, FloatArray
 
 _ROTATION_TOLERANCE = 1e-6  # poses that were composed thousands of times stay below it
 _COVARIANCE_TOLERANCE = 1e-9  # relative: what inverting an information matrix leaves

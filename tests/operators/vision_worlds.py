@@ -9,12 +9,11 @@ import numpy as np
 
 from mapstream.recordings.maps.build import append_edges, new_mission
 from mapstream.recordings.maps.cameras import Camera, with_cameras
-from mapstream.recordings.maps.columns import BoolArray
 from mapstream.recordings.maps.ids import derived_id, id_array, id_bytes, vertex_id
 from mapstream.recordings.maps.model import Map
 from mapstream.recordings.maps.rows import concatenate
 from mapstream.recordings.maps.tables import Edges, ImuSamples, Landmarks, Observations, Vertices
-from mapstream.streams.arrays import FloatArray, IntArray
+from mapstream.streams.arrays import BoolArray, FloatArray, IntArray
 from mapstream.streams.calibration import CameraCalibration
 from mapstream.streams.camera_models import project
 from mapstream.streams.geometry import SE3, invert, se3_exp, so3_exp, so3_log

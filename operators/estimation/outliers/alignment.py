@@ -20,9 +20,8 @@ from mapstream.operators.estimation.outliers.consistency import (
     mahalanobis,
     odometry_chain,
 )
-from mapstream.recordings.maps.columns import BoolArray
 from mapstream.recordings.maps.model import Map
-from mapstream.streams.arrays import FloatArray, IntArray
+from mapstream.streams.arrays import BoolArray, FloatArray, IntArray
 from mapstream.streams.geometry import invert, se3_log
 
 _SEEDS = 20  # loops with the most agreeing others, from each of which a set is grown

@@ -24,9 +24,8 @@ from mapstream.operators.estimation.outliers.hypotheses import Fix, FixHypothese
 from mapstream.operators.estimation.outliers.inertial_steps import InertialStep, inertial_step
 from mapstream.operators.estimation.outliers.lonely_fixes import lonely_fixes
 from mapstream.operators.estimation.starts.first_fixes import inertial_missions
-from mapstream.recordings.maps.columns import BoolArray
 from mapstream.recordings.maps.model import Map
-from mapstream.streams.arrays import FloatArray, IntArray
+from mapstream.streams.arrays import BoolArray, FloatArray, IntArray
 
 _UNMEASURED_M = 1e4  # the sigma of a direction that a fix says nothing of
 Verdicts = dict[int, bool]

@@ -24,8 +24,7 @@ from mapstream.operators.estimation.outliers.inertial_steps import (
     VELOCITY,
     InertialStep,
 )
-from mapstream.recordings.maps.columns import BoolArray
-from mapstream.streams.arrays import FloatArray, IntArray
+from mapstream.streams.arrays import BoolArray, FloatArray, IntArray
 from mapstream.streams.geometry import hat, so3_exp
 
 _NUM_HEADINGS = 16

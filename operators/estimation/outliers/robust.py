@@ -20,8 +20,7 @@ from mapstream.operators.estimation.outliers.consistency import chi2_gate, cycle
 from mapstream.operators.estimation.problem import Problem, chi2_of, dimensions
 from mapstream.operators.estimation.solvers import Graph, Limits, Solved, Solver
 from mapstream.operators.estimation.states import Values
-from mapstream.recordings.maps.columns import BoolArray
-from mapstream.streams.arrays import FloatArray
+from mapstream.streams.arrays import BoolArray, FloatArray
 from mapstream.streams.errors import EstimationError
 
 _NEGLIGIBLE = 100.0  # gates: beyond, a loop hardly pulls, and only fills the matrix

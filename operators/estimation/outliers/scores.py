@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from mapstream.recordings.maps.columns import BoolArray
 from mapstream.recordings.maps.model import Map
+from mapstream.streams.arrays import BoolArray
 from mapstream.streams.errors import RecordingError
 
 

@@ -18,9 +18,8 @@ from mapstream.operators.estimation.vision.sightings import Family, SensorState,
 from mapstream.operators.landmarks.motion import Motion, moments
 from mapstream.operators.landmarks.sensors import T_base_sensor_of, all_cameras, sensors_of
 from mapstream.operators.landmarks.views import capture_offsets_ns, point_sigmas_m
-from mapstream.recordings.maps.columns import BoolArray
 from mapstream.recordings.maps.model import Map
-from mapstream.streams.arrays import IntArray
+from mapstream.streams.arrays import BoolArray, IntArray
 from mapstream.streams.geometry import se3_exp
 
 FAMILIES: tuple[Family, ...] = ("keypoints", "points")

@@ -18,8 +18,7 @@ from mapstream.operators.estimation.vision.sightings import (
     errors,
     residuals,
 )
-from mapstream.recordings.maps.columns import BoolArray
-from mapstream.streams.arrays import FloatArray, IntArray
+from mapstream.streams.arrays import BoolArray, FloatArray, IntArray
 from mapstream.streams.geometry import hat
 
 Used = tuple[BoolArray, ...]  # by sightings: which observations (N,) take part

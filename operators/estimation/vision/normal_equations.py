@@ -18,8 +18,7 @@ from mapstream.operators.estimation.vision.bundle_state import (
     state_of,
 )
 from mapstream.operators.estimation.vision.schur import Blocks, Eliminated, Pairs, eliminate
-from mapstream.recordings.maps.columns import BoolArray
-from mapstream.streams.arrays import FloatArray, IntArray
+from mapstream.streams.arrays import BoolArray, FloatArray, IntArray
 
 if TYPE_CHECKING:
     from scipy.sparse import csc_array

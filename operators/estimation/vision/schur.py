@@ -17,8 +17,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from mapstream.recordings.maps.columns import BoolArray
-from mapstream.streams.arrays import FloatArray, IntArray
+from mapstream.streams.arrays import BoolArray, FloatArray, IntArray
 from mapstream.streams.geometry import hat
 
 if TYPE_CHECKING:

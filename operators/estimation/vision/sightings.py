@@ -17,8 +17,7 @@ import numpy as np
 
 from mapstream.operators.estimation.optimize_config import Loss
 from mapstream.operators.landmarks.motion import Moments
-from mapstream.recordings.maps.columns import BoolArray
-from mapstream.streams.arrays import FloatArray, IntArray
+from mapstream.streams.arrays import BoolArray, FloatArray, IntArray
 from mapstream.streams.calibration import CameraCalibration
 from mapstream.streams.camera_models import project, projection_jacobians
 from mapstream.streams.geometry import hat, se3_exp

@@ -11,9 +11,9 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from mapstream.operators.odometry.visual.sightings import BoolArray, Sightings, grouped
+from mapstream.operators.odometry.visual.sightings import Sightings, grouped
 from mapstream.operators.odometry.visual.triangulation import by_pose, gains_at
-from mapstream.streams.arrays import FloatArray
+from mapstream.streams.arrays import BoolArray, FloatArray
 from mapstream.streams.errors import EstimationError
 from mapstream.streams.geometry import invert, se3_exp, straightened
 

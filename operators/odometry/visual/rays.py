@@ -11,16 +11,14 @@ from dataclasses import dataclass
 from hashlib import blake2b
 
 import numpy as np
-import numpy.typing as npt
 
 from mapstream.operators.tracking.rays import rays
-from mapstream.streams.arrays import FloatArray, IntArray
+from mapstream.streams.arrays import BoolArray, FloatArray, IntArray
 from mapstream.streams.calibration import CameraCalibration
 from mapstream.streams.camera_models import unproject
 from mapstream.streams.errors import EstimationError
 from mapstream.streams.messages.vision import NO_TRACK, ImageFeatures, NFrame
 
-BoolArray = npt.NDArray[np.bool_]
 _STEP_PX = 2.0  # to either side, of the derivative
 
 

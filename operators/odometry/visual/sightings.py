@@ -5,12 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass, fields
 
 import numpy as np
-import numpy.typing as npt
 
 from mapstream.operators.odometry.visual.rays import Rays
-from mapstream.streams.arrays import FloatArray, IntArray
-
-BoolArray = npt.NDArray[np.bool_]
+from mapstream.streams.arrays import BoolArray, FloatArray, IntArray
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -9,14 +9,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
 from mapstream.operators.odometry.visual.elimination import Eliminated, eliminate
 from mapstream.operators.odometry.visual.sightings import Grouped
 from mapstream.operators.odometry.visual_inertial.state import NUM_INERTIAL, FilterState
-from mapstream.streams.arrays import FloatArray, IntArray
-
-BoolArray = npt.NDArray[np.bool_]
+from mapstream.streams.arrays import BoolArray, FloatArray, IntArray
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -15,16 +15,12 @@ import numpy as np
 from mapstream.operators.imu.parameters import ImuQuality
 from mapstream.operators.imu.samples import level_attitude
 from mapstream.operators.odometry.visual.elimination import eliminate
-from mapstream.operators.odometry.visual.sightings import (
-    BoolArray,
-    Sightings,
-    grouped,
-)
+from mapstream.operators.odometry.visual.sightings import Sightings, grouped
 from mapstream.operators.odometry.visual_inertial.epipolar_bias import epipolar_bias
 from mapstream.operators.odometry.visual_inertial.integration import Integrated, Integration
 from mapstream.operators.odometry.visual_inertial.linear_start import MotionStart, linear_start
 from mapstream.operators.odometry.visual_inertial.state import NUM_INERTIAL, FilterState
-from mapstream.streams.arrays import FloatArray
+from mapstream.streams.arrays import BoolArray, FloatArray
 from mapstream.streams.geometry import hat, so3_log
 
 _LEAST_POINTS, _LEAST_VIEWS, _MOST_POINTS = 10, 4, 80

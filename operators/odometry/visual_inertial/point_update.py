@@ -10,15 +10,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
 from mapstream.operators.odometry.visual.sightings import Sightings, grouped
 from mapstream.operators.odometry.visual.triangulation import by_pose, gains_at
 from mapstream.operators.odometry.visual_inertial.feature_update import Constraints, chi2_limit
 from mapstream.operators.odometry.visual_inertial.state import NUM_INERTIAL, FilterState
-from mapstream.streams.arrays import FloatArray, IntArray
+from mapstream.streams.arrays import BoolArray, FloatArray, IntArray
 
-BoolArray = npt.NDArray[np.bool_]
 _MOST_RELATIVE_SIGMA = 0.3  # of a distance: what is less certain has no linear error yet
 
 

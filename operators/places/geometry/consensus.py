@@ -16,8 +16,7 @@ from mapstream.operators.operator import OperatorConfig
 from mapstream.operators.places.geometry.minimal import aligned, p3p
 from mapstream.operators.places.geometry.refinement import Noise, RefinedPose, errors, refine
 from mapstream.operators.places.geometry.sightings import Sightings
-from mapstream.recordings.maps.columns import BoolArray
-from mapstream.streams.arrays import FloatArray, IntArray
+from mapstream.streams.arrays import BoolArray, FloatArray, IntArray
 from mapstream.streams.errors import EstimationError
 from mapstream.streams.geometry import invert
 

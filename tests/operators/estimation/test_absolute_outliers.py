@@ -10,10 +10,9 @@ import pytest
 from mapstream.operators.estimation.batch import OptimizeConfig, optimize_map
 from mapstream.operators.estimation.outliers.absolute_outliers import reject_absolute
 from mapstream.recordings.maps.build import append_edges
-from mapstream.recordings.maps.columns import BoolArray
 from mapstream.recordings.maps.model import Map
 from mapstream.recordings.maps.tables import Edges
-from mapstream.streams.arrays import FloatArray
+from mapstream.streams.arrays import BoolArray, FloatArray
 from mapstream.streams.geometry import SE3
 from tests.operators.estimation.problems import (
     cov,
