@@ -21,6 +21,11 @@ _SMALL_RAD = 1e-8  # below it the series' first term is exact in float64
 _EYE = np.eye(3)
 
 
+def symmetric(matrices: Array) -> Array:
+    """Return the symmetric parts of matrices (..., N, N); rounding leaves covariances a little lopsided."""
+    return (matrices + np.swapaxes(matrices, -1, -2)) / 2
+
+
 def hat(w: npt.ArrayLike) -> Array:
     """Return the skew-symmetric matrices (..., 3, 3) of vectors (..., 3)."""
     w = np.asarray(w, dtype=np.float64)

@@ -27,6 +27,7 @@ from mapstream.operators.operator import (
 from mapstream.streams.arrays import FloatArray
 from mapstream.streams.calibration import CameraCalibration
 from mapstream.streams.channel import Receiver, Sender
+from mapstream.streams.geometry import symmetric
 from mapstream.streams.messages.constraints import Constraint, LandmarkRef, OuterFrame
 from mapstream.streams.messages.sensors import CameraFrame
 
@@ -141,7 +142,7 @@ class Fiducials(Operator[Inputs, Outputs]):
             stamp_ns=frame.stamp_ns,
             kind="absolute",
             T_a_b=T_camera_frame.inverse(),
-            covariance=_symmetric(moved @ self._covariance(best) @ moved.T),
+            covariance=symmetric(moved @ self._covariance(best) @ moved.T),
             T_base_sensor=frame.T_base_sensor,
             outer=self._outer,
             is_switchable=self._config.is_switchable,
@@ -160,7 +161,7 @@ class Fiducials(Operator[Inputs, Outputs]):
             stamp_ns=frame.stamp_ns,
             kind="landmark",
             T_a_b=frame.T_base_sensor @ best.T_camera_points,
-            covariance=_symmetric(self._covariance(best)),
+            covariance=symmetric(self._covariance(best)),
             landmark=LandmarkRef(name=name, kind="pose", label="fiducial"),
             is_switchable=self._config.is_switchable,
             source=f"fiducials {frame.frame}",
@@ -191,7 +192,3 @@ def _is_other(a: PointsPose, b: PointsPose) -> bool:
     """Return whether two poses are apart by more than a solver's rounding."""
     difference = (a.T_camera_points.inverse() @ b.T_camera_points).log()
     return bool(np.abs(difference).max() > 1e-3)
-
-
-def _symmetric(covariance: FloatArray) -> FloatArray:
-    return (covariance + covariance.T) / 2

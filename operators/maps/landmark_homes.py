@@ -13,6 +13,7 @@ from mapstream.streams.geometry import (
     invert,
     quat_xyzw_from_rotation,
     rotation_from_quat_xyzw,
+    symmetric,
 )
 
 
@@ -44,15 +45,13 @@ def rehomed(map_: Map, keep: BoolArray) -> Map:
     quat[lost[is_turned]] = quat_xyzw_from_rotation(turned)
     covariance[lost] = R @ covariance[lost] @ np.swapaxes(R, 1, 2)
     moved: Landmarks = replace(
-        landmarks, vertex=vertex, p_base=p_base, quat_base_xyzw=quat, covariance=_even(covariance)
+        landmarks,
+        vertex=vertex,
+        p_base=p_base,
+        quat_base_xyzw=quat,
+        covariance=symmetric(covariance),
     )
     return replace(map_, landmarks=moved)
-
-
-def _even(
-    covariance: np.ndarray[tuple[int, ...], np.dtype[np.float64]],
-) -> np.ndarray[tuple[int, ...], np.dtype[np.float64]]:
-    return (covariance + np.swapaxes(covariance, 1, 2)) / 2
 
 
 def _first_observers(map_: Map, keep: BoolArray) -> IntArray:

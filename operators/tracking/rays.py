@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from mapstream.operators.images.pinhole_maps import calibration_key
 from mapstream.streams.arrays import Float32Array, FloatArray
 from mapstream.streams.calibration import CameraCalibration
 from mapstream.streams.camera_models import unproject
@@ -24,15 +25,8 @@ _SPACING_PX = 4
 class _Lens:
     """A camera that equals another with the same parameters, whichever message it came with."""
 
-    parameters: tuple[object, ...]
+    key: tuple[object, ...]
     camera: CameraCalibration = field(compare=False)
-
-    @classmethod
-    def of(cls, camera: CameraCalibration) -> _Lens:
-        arrays = (camera.focal_px, camera.center_px, camera.distortion_parameters)
-        numbers = tuple(tuple(array.tolist()) for array in arrays)
-        size = (camera.width_px, camera.height_px)
-        return cls((camera.model, camera.distortion, camera.xi, *size, *numbers), camera)
 
 
 def rays(camera: CameraCalibration, px: npt.NDArray[np.floating]) -> FloatArray:
@@ -40,7 +34,7 @@ def rays(camera: CameraCalibration, px: npt.NDArray[np.floating]) -> FloatArray:
     if len(px) == 0:
         return np.empty((0, 3))
     at = (px / _SPACING_PX).astype(np.float32)
-    table = _table(_Lens.of(camera))
+    table = _table(_Lens(calibration_key(camera), camera))
     blended = cv2.remap(
         table, at[:, :1], at[:, 1:], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
     )

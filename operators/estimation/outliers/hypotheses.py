@@ -25,7 +25,7 @@ from mapstream.operators.estimation.outliers.inertial_steps import (
     InertialStep,
 )
 from mapstream.streams.arrays import BoolArray, FloatArray, IntArray
-from mapstream.streams.geometry import hat, so3_exp
+from mapstream.streams.geometry import hat, so3_exp, symmetric
 
 _NUM_HEADINGS = 16
 _START_SIGMAS = (0.15, 0.15, 1.2 * np.pi / _NUM_HEADINGS, *[300.0] * 3, *[30.0] * 3)  # rad, m, m/s
@@ -159,7 +159,7 @@ def _split(beam: _Beam, fix: Fix) -> _Beam:
     chi2 = np.einsum("hi,hi->h", error, np.linalg.solve(spread, error[:, :, None])[:, :, 0])
     true = replace(
         _shifted(beam, _turned(gain, error)),
-        covariance=_symmetric(beam.covariance - gain @ with_fix.swapaxes(1, 2)),
+        covariance=symmetric(beam.covariance - gain @ with_fix.swapaxes(1, 2)),
         cost=beam.cost + 0.5 * (np.linalg.slogdet(spread)[1] + chi2),
     )
     anywhere = np.linalg.slogdet(spread + _REACH_M**2 * np.eye(3))[
@@ -169,10 +169,6 @@ def _split(beam: _Beam, fix: Fix) -> _Beam:
     both = [np.concatenate([getattr(each, f.name) for each in (true, false)]) for f in fields(beam)]
     verdict = np.repeat([True, False], len(beam.cost))
     return replace(_Beam(*both), is_true=np.column_stack([both[-1], verdict]))
-
-
-def _symmetric(matrices: FloatArray) -> FloatArray:
-    return (matrices + matrices.swapaxes(1, 2)) / 2
 
 
 def _thinned(beam: _Beam) -> _Beam:
