@@ -31,10 +31,16 @@ def frozen(
         expected = tuple("N" if want is None else want for want in shape)
         name = f"{type(owner).__name__}.{field}"
         raise ValueError(f"{name}: expected shape {expected}, got {array.shape}")
+    array = read_only(array)
+    object.__setattr__(owner, field, array)
+    return array
+
+
+def read_only(array: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    """Return a view that cannot be written; an array that cannot be is its own."""
     if array.flags.writeable:
         array = array.view()
         array.flags.writeable = False
-    object.__setattr__(owner, field, array)
     return array
 
 

@@ -25,6 +25,7 @@ from mapstream.streams.messages.estimates import (
     Splice,
     Submap,
 )
+from mapstream.streams.messages.planes import PlaneSegments
 from mapstream.streams.messages.sensors import (
     CameraFrame,
     EncodedImage,
@@ -165,6 +166,12 @@ def one_of_each(seed: int) -> list[Any]:
             stamp_ns=stamp, mission_id=mission, stamps_ns=np.arange(n),
             T_mission_base=np.array([pose().matrix for _ in range(n)]).reshape(n, 4, 4),
             T_mission_odom=pose(), T_map_mission=maybe(pose()),
+        ),
+        PlaneSegments(
+            stamp_ns=stamp, T_base_plane=np.array([pose().matrix for _ in range(n)]).reshape(n, 4, 4),
+            covariances=np.array([covariance() for _ in range(n)]).reshape(n, 6, 6),
+            hulls_m=tuple(rng.random((k + 2, 2)) for k in range(n)),
+            num_points=np.arange(n), rmse_m=rng.random(n), T_base_sensor=pose(),
         ),
         features,
         NFrame(stamp_ns=stamp, features=(features,) * n),
