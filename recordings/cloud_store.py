@@ -1,6 +1,7 @@
 """Keyframe clouds on disk, the ones in use in memory too, up to a bound.
 
-A cloud is an Arrow IPC file: `points`, and `intensity` where the sensor has it; its stamp is in the schema.
+A cloud is an Arrow IPC file: `points`, `intensity` where the sensor has it, and `colors_rgba` where cameras saw it;
+its stamp is in the schema.
 A cloud read back equals the one put, bit for bit, so it does not matter which of the two a caller gets.
 """
 
@@ -10,9 +11,10 @@ import re
 from collections import OrderedDict
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
+import numpy.typing as npt
 import pyarrow as pa
 
 from mapstream.recordings.maps.folder import write_whole
@@ -118,10 +120,11 @@ def write_cloud(path: Path, cloud: PointCloud, *, is_durable: bool = True) -> No
     Raises:
         MapError: If the disk refuses.
     """
-    points = pa.array(np.ascontiguousarray(cloud.points).reshape(-1))
-    columns = {"points": pa.FixedSizeListArray.from_arrays(points, 3)}
+    columns = {"points": _rows(cloud.points)}
     if cloud.intensity is not None:
         columns["intensity"] = pa.array(np.ascontiguousarray(cloud.intensity))
+    if cloud.colors_rgba is not None:
+        columns["colors_rgba"] = _rows(cloud.colors_rgba)
     batch = pa.record_batch(columns).replace_schema_metadata({"stamp_ns": str(cloud.stamp_ns)})
     sink = pa.BufferOutputStream()
     with pa.ipc.new_file(sink, batch.schema) as writer:
@@ -145,11 +148,20 @@ def read_cloud(path: Path) -> PointCloud:
         table = pa.ipc.open_file(data).read_all()
         table.validate(full=True)
         stamp_ns = int(table.schema.metadata[b"stamp_ns"])
-        points = table["points"].combine_chunks().flatten().to_numpy().reshape(-1, 3)
-        has_intensity = "intensity" in table.column_names
-        intensity = table["intensity"].combine_chunks().to_numpy() if has_intensity else None
-        return PointCloud(stamp_ns=stamp_ns, points=points, intensity=intensity)
+        columns = {name: table[name].combine_chunks() for name in table.column_names}
+        intensity, colors = columns.get("intensity"), columns.get("colors_rgba")
+        return PointCloud(
+            stamp_ns=stamp_ns,
+            points=columns["points"].flatten().to_numpy().reshape(-1, 3),
+            intensity=None if intensity is None else intensity.to_numpy(),
+            colors_rgba=None if colors is None else colors.flatten().to_numpy().reshape(-1, 4),
+        )
     except FileNotFoundError as error:
         raise MapError(f"{path}: no such cloud; was the map copied without its clouds?") from error
     except (pa.ArrowException, OSError, KeyError, TypeError, ValueError) as error:
         raise MapFormatError(f"{path}: damaged: {error}; restore it from a copy") from error
+
+
+def _rows(array: npt.NDArray[Any]) -> pa.FixedSizeListArray:
+    values = pa.array(np.ascontiguousarray(array).reshape(-1))
+    return pa.FixedSizeListArray.from_arrays(values, array.shape[1])

@@ -94,6 +94,21 @@ class GeodeticPlane:
         """Return places (N, 3) [m] of latitudes, longitudes [deg] and heights [m] (N, 3)."""
         return self._projected(lla) - self._zero
 
+    def coordinates(self, lla: FloatArray) -> FloatArray:
+        """Return the projection's own coordinates (N, 3) [m], which do not count from the origin."""
+        return self._projected(lla)
+
+    def wkt(self) -> str:
+        """Return the projection in the words of OGC; empty for a plane that is none.
+
+        Heights are above the ellipsoid.
+        """
+        import pyproj  # noqa: PLC0415  # takes half a second to import
+
+        return (
+            "" if self.crs == "enu" else str(pyproj.CRS.from_user_input(self.crs).to_3d().to_wkt())
+        )
+
     def to_lla(self, places: FloatArray) -> FloatArray:
         """Return latitudes, longitudes [deg] and heights [m] (N, 3) of places (N, 3) [m]."""
         moved = np.asarray(places, dtype=np.float64) + self._zero

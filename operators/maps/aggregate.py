@@ -6,17 +6,19 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
+import numpy.typing as npt
 from pydantic import PositiveFloat
 
 from mapstream.operators.lidar.sampling import voxel_keys
 from mapstream.operators.operator import OperatorConfig
 from mapstream.recordings.cloud_store import read_cloud
 from mapstream.recordings.maps.model import Map
-from mapstream.streams.arrays import FloatArray, IntArray
+from mapstream.streams.arrays import Float32Array, FloatArray, IntArray
 from mapstream.streams.errors import MapError
 from mapstream.streams.messages.estimates import PointCloud
 
 _MAX_VOXELS = 2**20  # from the origin; farther ones would share a key
+_NUM_SUMS = 9  # x, y, z, intensity, points, red, green, blue, points with a colour
 _MIN_MERGE = 1_000_000  # points that are collected before voxels are merged
 
 
@@ -50,12 +52,13 @@ def aggregate_cloud(map_: Map, folder: Path, config: AggregateConfig) -> PointCl
     for row, T_map_base in zip(chosen.tolist(), poses, strict=True):
         cloud = read_cloud(folder / resources.path[row])
         points_map = cloud.points.astype(np.float64) @ T_map_base[:3, :3].T + T_map_base[:3, 3]
-        voxels.add(points_map, cloud.intensity)
-    points, intensity = voxels.means()
+        voxels.add(points_map, cloud.intensity, cloud.colors_rgba)
+    points, intensity, colors = voxels.means()
     return PointCloud(
         stamp_ns=map_.stamp_ns,
         points=points.astype(np.float32),
         intensity=None if np.isnan(intensity).all() else intensity.astype(np.float32),
+        colors_rgba=colors if colors[:, 3].any() else None,
     )
 
 
@@ -65,19 +68,29 @@ class _Voxels:
 
     size_m: float
     keys: IntArray = field(default_factory=lambda: np.empty(0, dtype=np.int64))  # (V,) increasing
-    sums: FloatArray = field(default_factory=lambda: np.empty((0, 5)))  # x, y, z, intensity, count
+    sums: FloatArray = field(default_factory=lambda: np.empty((0, _NUM_SUMS)))
     _pending: list[FloatArray] = field(default_factory=list)
     _num_pending: int = 0
 
-    def add(self, points: FloatArray, intensity: np.ndarray | None) -> None:
-        columns = np.full(len(points), np.nan) if intensity is None else intensity
-        self._pending.append(np.column_stack([points, columns, np.ones(len(points))]))
+    def add(
+        self,
+        points: FloatArray,
+        intensity: Float32Array | None,
+        colors_rgba: npt.NDArray[np.uint8] | None,
+    ) -> None:
+        rows = np.zeros((len(points), _NUM_SUMS))
+        rows[:, :3], rows[:, 4] = points, 1.0
+        rows[:, 3] = np.nan if intensity is None else intensity
+        if colors_rgba is not None:
+            is_seen = colors_rgba[:, 3] > 0
+            rows[is_seen, 5:8], rows[is_seen, 8] = colors_rgba[is_seen, :3], 1.0
+        self._pending.append(rows)
         self._num_pending += len(points)
         if self._num_pending >= max(_MIN_MERGE, len(self.keys)):  # as much as a merge sorts anyway
             self._merge()
 
     def _merge(self) -> None:
-        rows = np.concatenate([np.empty((0, 5)), *self._pending])
+        rows = np.concatenate([np.empty((0, _NUM_SUMS)), *self._pending])
         reach_m = _MAX_VOXELS * self.size_m
         if np.abs(rows[:, :3]).max(initial=0) >= reach_m:
             raise MapError(
@@ -90,8 +103,11 @@ class _Voxels:
         self.sums = np.column_stack(columns)
         self._pending, self._num_pending = [], 0
 
-    def means(self) -> tuple[FloatArray, FloatArray]:
-        """Return the mean points (V, 3) and intensities (V,), in the order of the voxels."""
+    def means(self) -> tuple[FloatArray, FloatArray, npt.NDArray[np.uint8]]:
+        """Return the mean points (V, 3), intensities (V,) and colours (V, 4), in the order of the voxels."""
         self._merge()
-        means = self.sums[:, :4] / self.sums[:, 4:]
-        return means[:, :3], means[:, 3]
+        means = self.sums[:, :4] / self.sums[:, 4:5]
+        num_seen = self.sums[:, 8:]
+        colors = np.round(self.sums[:, 5:8] / np.maximum(num_seen, 1.0))
+        rgba = np.hstack([colors, np.where(num_seen > 0, 255.0, 0.0)]).astype(np.uint8)
+        return means[:, :3], means[:, 3], rgba

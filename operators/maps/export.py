@@ -8,13 +8,16 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
+import numpy.typing as npt
 
 from mapstream.operators.maps.aggregate import AggregateConfig, aggregate_cloud
 from mapstream.operators.maps.colmap import colmap_model
 from mapstream.operators.maps.csv_tables import write_tables
+from mapstream.operators.maps.geo_clouds import georeferenced
 from mapstream.recordings.cloud_files import write_pcd, write_ply
 from mapstream.recordings.colmap import write_model
 from mapstream.recordings.g2o import write_g2o
+from mapstream.recordings.las_files import write_las
 from mapstream.recordings.maps.edge_kinds import RELATIVE_KINDS
 from mapstream.recordings.maps.model import Map
 from mapstream.recordings.mcap_writer import McapWriter
@@ -22,12 +25,16 @@ from mapstream.recordings.trajectory_files import write_euroc, write_kitti, writ
 from mapstream.streams.arrays import IntArray
 from mapstream.streams.errors import MapError
 from mapstream.streams.geometry import SE3
-from mapstream.streams.messages.estimates import Odometry, RelativePose
+from mapstream.streams.messages.estimates import Odometry, PointCloud, RelativePose
 from mapstream.streams.trajectory import Trajectory
 
 
 class ExportConfig(AggregateConfig):
     """What is exported; the voxels are those of clouds."""
+
+    crs: str = "utm"
+    """The projection of `.las` and `.laz`: `utm`, or EPSG:32632 ...; `map` keeps the map's own axes, as a map
+    without a place on Earth does."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -40,7 +47,7 @@ class ExportReport:
 
 
 def export_map(map_: Map, folder: Path, path: Path, config: ExportConfig) -> ExportReport:
-    """Write a map as `.tum`, `.kitti`, `.csv` (EuRoC), `.g2o`, `.colmap`, `.ply`, `.pcd`, `.mcap` or CSV tables.
+    """Write a map as `.tum`, `.kitti`, `.csv` (EuRoC), `.g2o`, `.colmap`, `.ply`, `.pcd`, `.las`, `.laz`, `.mcap` or CSV tables.
 
     Args:
         map_: The map.
@@ -107,14 +114,28 @@ def _colmap(map_: Map, folder: Path, path: Path, config: ExportConfig) -> Export
 
 def _ply(map_: Map, folder: Path, path: Path, config: ExportConfig) -> ExportReport:
     cloud = aggregate_cloud(map_, folder, config)
-    write_ply(path, cloud.points, cloud.intensity)
+    write_ply(path, cloud.points, cloud.intensity, _colors(cloud))
     return ExportReport(files=(path,), written={"points": len(cloud.points)})
 
 
 def _pcd(map_: Map, folder: Path, path: Path, config: ExportConfig) -> ExportReport:
     cloud = aggregate_cloud(map_, folder, config)
-    write_pcd(path, cloud.points, cloud.intensity)
+    write_pcd(path, cloud.points, cloud.intensity, _colors(cloud))
     return ExportReport(files=(path,), written={"points": len(cloud.points)})
+
+
+def _las(map_: Map, folder: Path, path: Path, config: ExportConfig) -> ExportReport:
+    cloud = aggregate_cloud(map_, folder, config)
+    placed = georeferenced(map_, cloud.points.astype(np.float64), config.crs)
+    write_las(path, placed.points, cloud.intensity, _colors(cloud), placed.wkt)
+    return ExportReport(
+        files=(path,), written={f"points in {placed.crs or 'the map frame'}": len(cloud.points)}
+    )
+
+
+def _colors(cloud: PointCloud) -> npt.NDArray[np.uint8] | None:
+    """Return red, green and blue (N, 3), black where no camera looked; None if none looked anywhere."""
+    return None if cloud.colors_rgba is None else cloud.colors_rgba[:, :3]
 
 
 def _mcap(map_: Map, folder: Path, path: Path, config: ExportConfig) -> ExportReport:  # noqa: ARG001
@@ -171,6 +192,8 @@ EXPORTERS: dict[str, Callable[[Map, Path, Path, ExportConfig], ExportReport]] = 
     ".colmap": _colmap,
     ".ply": _ply,
     ".pcd": _pcd,
+    ".las": _las,
+    ".laz": _las,
     ".mcap": _mcap,
     "": _csv_tables,
 }

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
+import numpy.typing as npt
 
 from mapstream.streams.arrays import Float32Array, FloatArray, IntArray, frozen, frozen_optional
 from mapstream.streams.geometry import SE3
@@ -43,11 +44,13 @@ class PointCloud:
     stamp_ns: int
     points: Float32Array  # (N, 3) [m]
     intensity: Float32Array | None = None  # (N,)
+    colors_rgba: npt.NDArray[np.uint8] | None = None  # (N, 4); alpha 0 where no camera saw it
     record: RecordRef | None = None  # the raw measurement it was made from
 
     def __post_init__(self) -> None:
         n = frozen(self, "points", np.float32, (None, 3)).shape[0]
         frozen_optional(self, "intensity", np.float32, (n,))
+        frozen_optional(self, "colors_rgba", np.uint8, (n, 4))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

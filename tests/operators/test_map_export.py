@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import csv
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from pyproj import Transformer
 
 from mapstream.operators.maps.export import EXPORTERS, ExportConfig, export_map
 from mapstream.operators.maps.import_ import import_map
@@ -14,13 +16,14 @@ from mapstream.operators.maps.trajectory_map import ImportConfig
 from mapstream.recordings.cloud_files import read_pcd, read_ply
 from mapstream.recordings.cloud_store import CloudStore
 from mapstream.recordings.decoding import decoder_for
+from mapstream.recordings.las_files import read_las
 from mapstream.recordings.maps import Map, check_map
 from mapstream.recordings.maps.build import add_resources, anchored, append_edges
 from mapstream.recordings.maps.combine import merge_maps
-from mapstream.recordings.maps.tables import Edges
+from mapstream.recordings.maps.tables import Edges, Frames
 from mapstream.recordings.recording import open_recording
 from mapstream.streams.errors import MapError
-from mapstream.streams.geometry import SE3
+from mapstream.streams.geometry import SE3, so3_exp
 from mapstream.streams.messages.estimates import Odometry, PointCloud, RelativePose
 from tests.recordings.made_maps import MISSION, OTHER_MISSION, full_map, line_map
 
@@ -34,8 +37,10 @@ def placed_map() -> Map:
 
 def map_with_clouds(folder: Path) -> Map:
     points = np.random.default_rng(0).uniform(-5, 5, (300, 3)).astype(np.float32)
+    colors = np.full((300, 4), [200, 100, 50, 255], np.uint8)
     with CloudStore(folder / "clouds") as store:
-        store.put("c", PointCloud(stamp_ns=0, points=points, intensity=points[:, 2]))
+        cloud = PointCloud(stamp_ns=0, points=points, intensity=points[:, 2], colors_rgba=colors)
+        store.put("c", cloud)
     return add_resources(
         placed_map(), vertex_rows=np.array([0]), kind="cloud", paths=["clouds/c.arrow"]
     )
@@ -101,6 +106,52 @@ def test_O2_S3_clouds_are_written_in_the_map_frame(tmp_path: Path) -> None:
         np.testing.assert_allclose(cloud.points.mean(axis=0), T_map_base[:3, 3], atol=0.7)
 
 
+@pytest.mark.parametrize("suffix", [".las", ".laz"])
+def test_S3_las_keeps_points_and_colours_of_a_map_without_a_place_on_earth(
+    suffix: str, tmp_path: Path
+) -> None:
+    map_ = map_with_clouds(tmp_path)
+    export_map(map_, tmp_path, tmp_path / "map.ply", CONFIG)
+    export_map(map_, tmp_path, tmp_path / f"map{suffix}", CONFIG)
+
+    cloud, as_ply = read_las(tmp_path / f"map{suffix}"), read_ply(tmp_path / "map.ply")
+
+    assert cloud.crs == ""
+    np.testing.assert_allclose(cloud.points, as_ply.points, atol=0.00051)
+    assert cloud.colors_rgb is not None
+    assert cloud.colors_rgb.tolist() == [[200, 100, 50]] * len(cloud.points)
+
+
+def test_O10_a_map_with_satellites_lies_in_utm_within_a_centimetre(tmp_path: Path) -> None:
+    map_ = map_with_clouds(tmp_path)
+    origin_lla = np.array([47.3769, 8.5417, 450.0])
+    turn = SE3.from_rotation(so3_exp([0.0, 0.0, 0.7]), [120.0, -40.0, 3.0])  # T_map_frame
+    frames = Frames(
+        id=np.zeros((1, 16), np.uint8), name=np.array(["enu"], dtype=object),
+        T_map_frame=turn.matrix[None], is_known=np.array([True]),
+        crs=np.array(["enu"], dtype=object), origin_lla=origin_lla[None],
+    )  # fmt: skip
+    map_ = replace(map_, frames=frames)
+    export_map(map_, tmp_path, tmp_path / "map.ply", CONFIG)
+
+    export_map(map_, tmp_path, tmp_path / "map.laz", CONFIG)
+
+    cloud = read_las(tmp_path / "map.laz")
+    points = read_ply(tmp_path / "map.ply").points.astype(np.float64)
+    in_enu = (points - turn.t) @ turn.R  # R^T p
+    to_ecef = Transformer.from_crs("EPSG:4979", "EPSG:4978").transform
+    east, north = np.radians(origin_lla[1]), np.radians(origin_lla[0])
+    se, ce, sn, cn = np.sin(east), np.cos(east), np.sin(north), np.cos(north)
+    axes = np.array([[-se, -sn * ce, cn * ce], [ce, -sn * se, cn * se], [0, cn, sn]])
+    ecef = np.array(to_ecef(*origin_lla)) + in_enu @ axes.T
+    expected = np.column_stack(Transformer.from_crs("EPSG:4978", "EPSG:32632").transform(*ecef.T))
+    assert "UTM zone 32N" in cloud.crs
+    np.testing.assert_allclose(cloud.points[:, :2], expected[:, :2], atol=0.01)
+    config, nowhere = ExportConfig(crs="EPSG:32632"), map_with_clouds(tmp_path)
+    with pytest.raises(MapError, match="never saw a satellite"):
+        export_map(nowhere, tmp_path, tmp_path / "map.las", config)
+
+
 def test_S6_poses_and_edges_go_into_a_recording(tmp_path: Path) -> None:
     map_ = placed_map()
 
@@ -121,9 +172,9 @@ def test_S6_poses_and_edges_go_into_a_recording(tmp_path: Path) -> None:
 
 
 def test_unknown_formats_are_refused(tmp_path: Path) -> None:
-    known = r"known are \.tum, \.kitti, \.csv, \.g2o, \.colmap, \.ply, \.pcd, \.mcap"
-    with pytest.raises(MapError, match=rf"map\.las: unknown format '\.las'; {known}"):
-        export_map(full_map(), tmp_path, tmp_path / "map.las", CONFIG)
+    known = r"known are \.tum, \.kitti, \.csv, \.g2o, \.colmap, \.ply, \.pcd, \.las, \.laz, \.mcap"
+    with pytest.raises(MapError, match=rf"map\.e57: unknown format '\.e57'; {known}"):
+        export_map(full_map(), tmp_path, tmp_path / "map.e57", CONFIG)
     with pytest.raises(
         MapError, match=r"unknown format '\.bag'; known are suffixes \.tum, \.kitti"
     ):

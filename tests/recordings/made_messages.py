@@ -81,7 +81,10 @@ def one_of_each(seed: int) -> list[Any]:
     ref = RecordRef(path="a.mcap", topic="/x", log_ns=stamp)
     points = rng.normal(size=(n, 3)).astype(np.float32)
     intensity = rng.random(n).astype(np.float32)
-    cloud = PointCloud(stamp_ns=stamp, points=points, intensity=maybe(intensity))
+    cloud = PointCloud(
+        stamp_ns=stamp, points=points, intensity=maybe(intensity),
+        colors_rgba=maybe(rng.integers(0, 255, (n, 4), np.uint8)),
+    )  # fmt: skip
     odometry = Odometry(
         stamp_ns=stamp,
         T_odom_base=pose(),

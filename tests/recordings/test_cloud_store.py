@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,9 +17,13 @@ from mapstream.streams.sizes import nbytes
 
 
 def cloud(num_points: int, seed: int = 0, *, with_intensity: bool = True) -> PointCloud:
-    points = np.random.default_rng(seed).normal(size=(num_points, 3)).astype(np.float32)
+    rng = np.random.default_rng(seed)
+    points = rng.normal(size=(num_points, 3)).astype(np.float32)
     return PointCloud(
-        stamp_ns=seed, points=points, intensity=points[:, 0] if with_intensity else None
+        stamp_ns=seed,
+        points=points,
+        intensity=points[:, 0] if with_intensity else None,
+        colors_rgba=rng.integers(0, 255, (num_points, 4), np.uint8) if seed % 2 else None,
     )
 
 
@@ -28,10 +33,13 @@ def assert_equal(a: PointCloud, b: PointCloud) -> None:
     assert (a.intensity is None) == (b.intensity is None)
     if a.intensity is not None and b.intensity is not None:
         assert a.intensity.tobytes() == b.intensity.tobytes()
+    assert (a.colors_rgba is None) == (b.colors_rgba is None)
+    if a.colors_rgba is not None and b.colors_rgba is not None:
+        assert a.colors_rgba.tobytes() == b.colors_rgba.tobytes()
 
 
 def test_I8_memory_stays_bounded_while_all_clouds_are_kept(tmp_path: Path) -> None:
-    size = nbytes(cloud(100))
+    size = nbytes(cloud(100, 1))
     with CloudStore(tmp_path, max_bytes=3 * size) as store:
         for n in range(20):
             store.put(f"c{n}", cloud(100, n))
@@ -44,12 +52,12 @@ def test_I8_memory_stays_bounded_while_all_clouds_are_kept(tmp_path: Path) -> No
 
 
 def test_what_was_used_last_is_kept_in_memory(tmp_path: Path) -> None:
-    with CloudStore(tmp_path, max_bytes=2 * nbytes(cloud(10))) as store:
+    with CloudStore(tmp_path, max_bytes=2 * nbytes(cloud(10, 1))) as store:
         first = cloud(10, 1)
         store.put("a", first)
-        store.put("b", cloud(10, 2))
+        store.put("b", cloud(10, 3))
         store.get("a")
-        store.put("c", cloud(10, 3))
+        store.put("c", cloud(10, 5))
 
         assert store.get("a") is first
         assert store.get("b") is not None
@@ -67,7 +75,7 @@ def test_a_cloud_larger_than_the_bound_is_read_from_disk(tmp_path: Path) -> None
 @given(st.integers(0, 50), st.booleans(), st.integers(-(2**63), 2**63 - 1))
 def test_a_cloud_survives_its_file(num_points: int, with_intensity: bool, stamp_ns: int) -> None:  # noqa: FBT001
     made = cloud(num_points, 1, with_intensity=with_intensity)
-    put = PointCloud(stamp_ns=stamp_ns, points=made.points, intensity=made.intensity)
+    put = replace(made, stamp_ns=stamp_ns)
     with CloudStore(max_bytes=0) as store:
         store.put("key", put)
         once = store.path_of("key").read_bytes()
