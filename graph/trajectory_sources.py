@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -11,14 +12,23 @@ from mapstream.recordings.decoding import decoder_for
 from mapstream.recordings.maps import load_map
 from mapstream.recordings.maps.store import MANIFEST
 from mapstream.recordings.recording import open_recording
-from mapstream.recordings.trajectory_files import read_euroc, read_kitti, read_tum
+from mapstream.recordings.trajectory_files import (
+    read_corrected,
+    read_euroc,
+    read_kitti,
+    read_tum,
+)
 from mapstream.streams.errors import MapError, RecordingError
 from mapstream.streams.messages.estimates import Odometry
 from mapstream.streams.trajectory import Trajectory
 
 TRUTH = "/truth"  # the topic that synthetic recordings have
 _RECORDINGS = (".mcap", ".bag", ".db3")
-_READERS = {8: read_tum, 12: read_kitti}  # by the numbers in a line
+_READERS: dict[int, Callable[[Path], Trajectory]] = {  # by the numbers in a line
+    5: lambda path: read_corrected(path)[1],
+    8: read_tum,
+    12: read_kitti,
+}
 
 
 def read_trajectory(
@@ -27,7 +37,7 @@ def read_trajectory(
     """Read a trajectory.
 
     Args:
-        path: The folder of a map, a recording, or a TUM, KITTI or EuRoC file.
+        path: The folder of a map, a recording, or a TUM, KITTI or EuRoC file, or corrected poses of a laser log.
         topic: Of a recording: the topic with the poses; `/truth` or the only one by default.
         mission: Of a map: the first digits of the mission's id; needed if there are several.
 
@@ -45,8 +55,8 @@ def read_trajectory(
     read = _READERS.get(len(line.split()))
     if read is None:
         raise RecordingError(
-            f"{path}: no trajectory: expected 8 numbers a line (TUM), 12 (KITTI) or commas (EuRoC),"
-            f" found {line[:60]!r}"
+            f"{path}: no trajectory: expected 8 numbers a line (TUM), 12 (KITTI), 5 (corrected laser log)"
+            f" or commas (EuRoC), found {line[:60]!r}"
         )
     return read(path)
 

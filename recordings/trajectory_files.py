@@ -1,10 +1,11 @@
-"""Trajectories as text: TUM, KITTI and EuRoC, with stamps exact to the nanosecond.
+"""Trajectories as text: TUM, KITTI, EuRoC and corrected laser logs, with stamps exact to the nanosecond.
 
 | format | a line | stamps |
 |---|---|---|
 | TUM | `stamp tx ty tz qx qy qz qw` | seconds |
 | KITTI | the first three rows of the pose, row by row | none; a `times.txt` beside it may have them |
 | EuRoC | `stamp,px,py,pz,qw,qx,qy,qz` and more columns, which are ignored | nanoseconds |
+| corrected laser log | `line stamp x y yaw`, where `line` counts the log's laser lines from 0 | seconds |
 """
 
 from __future__ import annotations
@@ -19,7 +20,12 @@ import numpy as np
 from mapstream.recordings.maps.folder import write_whole
 from mapstream.streams.arrays import FloatArray, IntArray
 from mapstream.streams.errors import RecordingError
-from mapstream.streams.geometry import SE3, quat_xyzw_from_rotation, rotation_from_quat_xyzw
+from mapstream.streams.geometry import (
+    SE3,
+    quat_xyzw_from_rotation,
+    rotation_from_quat_xyzw,
+    se3_exp,
+)
 from mapstream.streams.trajectory import Trajectory
 
 KITTI_PERIOD_NS = 100_000_000  # nominal, for poses without a file of times
@@ -41,13 +47,13 @@ class _Line:
             raise RecordingError(f"{self.place}: expected finite numbers, found {fields}")
         return values
 
-    def stamp_ns(self, unit_ns: int) -> int:
-        """Return the first field as nanoseconds, without a detour through floats."""
+    def stamp_ns(self, unit_ns: int, field: int = 0) -> int:
+        """Return a field as nanoseconds, without a detour through floats."""
         try:
-            return int((Decimal(self.fields[0]) * unit_ns).to_integral_value())
+            return int((Decimal(self.fields[field]) * unit_ns).to_integral_value())
         except (InvalidOperation, ValueError, OverflowError) as error:
             raise RecordingError(
-                f"{self.place}: expected a stamp, found {self.fields[0]!r}"
+                f"{self.place}: expected a stamp, found {self.fields[field]!r}"
             ) from error
 
     def pose(self, t: Sequence[str], quat_xyzw: Sequence[str]) -> FloatArray:
@@ -106,6 +112,22 @@ def read_kitti(path: str | Path, times: str | Path | None = None) -> Trajectory:
                 f"{path}: expected as many times as poses, {len(poses)}, found {found}"
             )
     return Trajectory(stamps_ns=stamps_ns, poses=np.array(poses).reshape(-1, 4, 4))
+
+
+def read_corrected(path: str | Path) -> tuple[IntArray, Trajectory]:
+    """Read the corrected poses of a laser log; return the laser lines (N,) that they belong to, and the poses.
+
+    Raises:
+        RecordingError: If the file is absent, or a line is not what it should be; with the line.
+    """
+    lines = list(_lines(Path(path), None, 5))
+    numbers = np.array([line.floats(line.fields[:1]) for line in lines]).reshape(-1)
+    stamps = [line.stamp_ns(10**9, field=1) for line in lines]
+    x, y, yaw = np.array([line.floats(line.fields[2:5]) for line in lines]).reshape(-1, 3).T
+    poses = se3_exp(np.stack([0 * x, 0 * x, yaw, 0 * x, 0 * x, 0 * x], axis=-1))
+    poses[:, 0, 3], poses[:, 1, 3] = x, y
+    trajectory = Trajectory(stamps_ns=_increasing(lines, stamps), poses=poses)
+    return numbers.astype(np.int64), trajectory
 
 
 def read_times(path: str | Path) -> IntArray:

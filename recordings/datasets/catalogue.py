@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
+from mapstream.recordings.datasets.carmen import convert_carmen
 from mapstream.recordings.datasets.conversion import Convert, Notices, Progress
 from mapstream.recordings.datasets.described_csv import convert_csv
 from mapstream.recordings.datasets.eqvio import convert_eqvio, eqvio_file
@@ -13,7 +14,9 @@ from mapstream.recordings.datasets.euroc import convert_euroc
 from mapstream.recordings.datasets.kitti import convert_kitti
 from mapstream.recordings.datasets.kitti_inertial import convert_kitti_inertial, gtsam_data
 from mapstream.recordings.datasets.lidar_bins import convert_lidar_bins
+from mapstream.recordings.datasets.mines import convert_mines
 from mapstream.recordings.datasets.pcd_folder import convert_pcd_folder
+from mapstream.recordings.datasets.rawlog import convert_rawlog
 from mapstream.recordings.datasets.seven_scenes import convert_seven_scenes
 from mapstream.recordings.datasets.tum_rgbd import convert_tum_rgbd
 from mapstream.recordings.mcap_whole import whole_mcap
@@ -58,6 +61,7 @@ def convert_tum(source: Path, writer: McapWriter, on_progress: Progress) -> Noti
 
 CONVERTERS = {
     "csv": Converter("CSV whose header names IMU, GNSS, odometry, positions", convert_csv),
+    "carmen": Converter("CARMEN log of a planar laser, also .bz2", convert_carmen),
     "eqvio": Converter(
         "30 s of EuRoC V1_01 as feature tracks and IMU from the installed gtsam; needs no PATH",
         convert_eqvio,
@@ -71,9 +75,11 @@ CONVERTERS = {
         gtsam_data,
     ),
     "lidar_bins": Converter("folder of deskewed scans with alidarPose.csv", convert_lidar_bins),
+    "mines": Converter("log of Mines ParisTech: planar laser, wheels", convert_mines),
     "pcd": Converter(
         "folder of PCD clouds, with associated.txt or named for stamps", convert_pcd_folder
     ),
+    "rawlog": Converter("MRPT rawlog of a planar laser, wheels", convert_rawlog),
     "rosbag": Converter("ROS 1 bag, rosbag2 or MCAP", convert_rosbag),
     "tum": Converter("folder of a TUM RGB-D sequence, or a TUM trajectory", convert_tum),
     "7scenes": Converter("folder of a 7-Scenes sequence", convert_seven_scenes),
