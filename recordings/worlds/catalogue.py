@@ -12,6 +12,7 @@ from pydantic import BaseModel, ValidationError
 from mapstream.recordings.attached_rig import attach_rig
 from mapstream.recordings.mcap_whole import whole_mcap
 from mapstream.recordings.worlds.simulation import Simulation
+from mapstream.recordings.worlds.w_2d import W2dConfig, w_2d
 from mapstream.recordings.worlds.w_lid import WLidConfig, w_lid
 from mapstream.recordings.worlds.w_pan import WPanConfig, w_pan
 from mapstream.recordings.worlds.w_rgbd import WRgbdConfig, w_rgbd
@@ -30,6 +31,7 @@ class World:
 
 WORLDS = {
     "w_lid": World("a loop of corridors, LiDAR, IMU, drifting odometry", WLidConfig, w_lid),
+    "w_2d": World("an office, planar laser, wheels that slip, the plan", W2dConfig, w_2d),
     "w_rgbd": World("a room with a table, colour and depth camera, IMU", WRgbdConfig, w_rgbd),
     "w_vi": World("a hall, five cameras, IMU, drifting odometry, GPS and tags", WViConfig, w_vi),
     "w_pan": World("a room, a depth camera that pans and tilts, /tf", WPanConfig, w_pan),

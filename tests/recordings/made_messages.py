@@ -25,6 +25,7 @@ from mapstream.streams.messages.estimates import (
     Splice,
     Submap,
 )
+from mapstream.streams.messages.grids import OccupancyGrid
 from mapstream.streams.messages.planes import PlaneSegments
 from mapstream.streams.messages.sensors import (
     CameraFrame,
@@ -169,6 +170,9 @@ def one_of_each(seed: int) -> list[Any]:
             stamp_ns=stamp, mission_id=mission, stamps_ns=np.arange(n),
             T_mission_base=np.array([pose().matrix for _ in range(n)]).reshape(n, 4, 4),
             T_mission_odom=pose(), T_map_mission=maybe(pose()),
+        ),
+        OccupancyGrid(
+            stamp_ns=stamp, cells=rng.integers(-1, 101, (n, 3)), resolution_m=0.05, T_map_grid=pose()
         ),
         PlaneSegments(
             stamp_ns=stamp, T_base_plane=np.array([pose().matrix for _ in range(n)]).reshape(n, 4, 4),
