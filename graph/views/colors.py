@@ -48,6 +48,13 @@ def ramp_colors(
     return colors
 
 
+def photographed(colors: ColorArray, rgba: npt.NDArray[np.uint8]) -> ColorArray:
+    """Return colours (N,) where those that cameras saw (N, 4) take the place of others."""
+    seen = _packed(*np.moveaxis(rgba.astype(np.uint32), -1, 0))
+    mixed: ColorArray = np.where(rgba[:, 3] > 0, seen, colors)
+    return mixed
+
+
 def switch_colors(switches: npt.NDArray[np.floating]) -> ColorArray:
     """Return colours (N,) of switch values (N,): red where an edge is off (0), green where on (1)."""
     on = np.clip(np.nan_to_num(switches), 0, 1)

@@ -6,7 +6,7 @@ import numpy as np
 import numpy.typing as npt
 import rerun as rr
 
-from mapstream.graph.views.colors import ColorArray, ramp_colors
+from mapstream.graph.views.colors import ColorArray, photographed, ramp_colors
 from mapstream.graph.views.scene import BASE, Drawing, Scene, sensor_frame
 from mapstream.streams.arrays import Float32Array
 from mapstream.streams.messages.estimates import PointCloud
@@ -26,9 +26,12 @@ def view_lidar_scan(scan: LidarScan, scene: Scene) -> Drawing:
 
 
 def view_point_cloud(cloud: PointCloud, scene: Scene) -> Drawing:
-    """Draw the points around the robot, coloured by intensity, else by height."""
+    """Draw the points around the robot, as cameras saw them, else coloured by intensity, else by height."""
     points, intensity = thinned(cloud.points, cloud.intensity, scene.settings.max_points)
     colors = _point_colors(points, intensity, scene)
+    if cloud.colors_rgba is not None:
+        step = _step(len(cloud.points), scene.settings.max_points)
+        colors = photographed(colors, cloud.colors_rgba[::step])
     return scene.within("", BASE, rr.Points3D(points, colors=colors, radii=_POINT_SIZE))
 
 
@@ -47,10 +50,12 @@ def thinned(
     points: Float32Array, intensity: Float32Array | None, max_points: int
 ) -> tuple[Float32Array, Float32Array | None]:
     """Return every n-th point (M, 3) and its intensity (M,), so that there are at most `max_points`."""
-    step = -(-len(points) // max_points) if max_points else 1
-    if step <= 1:
-        return points, intensity
+    step = _step(len(points), max_points)
     return points[::step], None if intensity is None else intensity[::step]
+
+
+def _step(num: int, max_points: int) -> int:
+    return max(1, -(-num // max_points)) if max_points else 1
 
 
 def height_colors(heights_m: npt.NDArray[np.floating], scene: Scene) -> ColorArray:

@@ -7,7 +7,7 @@ import math
 import numpy as np
 import rerun as rr
 
-from mapstream.graph.views.ceiling import without_ceiling
+from mapstream.graph.views.ceiling import is_below_ceiling
 from mapstream.graph.views.colors import ACCEPTED, DRIVEN, REFUSED, mission_color
 from mapstream.graph.views.growing import MAP_PATH, redraw_loops, redraw_mission
 from mapstream.graph.views.lidar import height_colors, thinned
@@ -104,4 +104,4 @@ def _cloud(submap: Submap, poses: list[SE3], max_points: int) -> Float32Array:
         if keyframe.cloud is not None
     ]
     points = np.concatenate([np.empty((0, 3)), *clouds]).astype(np.float32)
-    return without_ceiling(points, np.array([pose.t for pose in poses]))
+    return points[is_below_ceiling(points, np.array([pose.t for pose in poses]))]

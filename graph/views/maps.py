@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import rerun as rr
 
-from mapstream.graph.views.ceiling import without_ceiling
-from mapstream.graph.views.colors import switch_colors
+from mapstream.graph.views.ceiling import is_below_ceiling
+from mapstream.graph.views.colors import photographed, switch_colors
 from mapstream.graph.views.constraints import place_frames
 from mapstream.graph.views.drive import drive_entries
 from mapstream.graph.views.growing import LINE, MAP_PATH, redraw_loops, redraw_mission
@@ -43,10 +43,13 @@ def view_map(map_: Map, scene: Scene) -> Drawing:
 
 
 def cloud_entry(map_: Map, cloud: PointCloud, scene: Scene) -> Entry:
-    """Draw the cloud of a whole map, in its frame, coloured by height, without a ceiling."""
+    """Draw the cloud of a whole map, in its frame, without a ceiling, as cameras saw it, else coloured by height."""
     path = map_.T_map_base(np.arange(len(map_.vertices)))[:, :3, 3]
-    points = without_ceiling(cloud.points, path)
+    shown = is_below_ceiling(cloud.points, path)
+    points = cloud.points[shown]
     colors = height_colors(points[:, 2], scene)
+    if cloud.colors_rgba is not None:
+        colors = photographed(colors, cloud.colors_rgba[shown])
     return Entry.of(f"{MAP_PATH}/cloud", rr.Points3D(points, colors=colors, radii=_CLOUD_SIZE))
 
 
