@@ -25,6 +25,7 @@ OperatorType = type[Operator[Any, Any]]
 BUILT_IN = {
     "absolute_poses": "mapstream.operators.absolute.poses:AbsolutePoses",
     "clahe": "mapstream.operators.images.clahe:Clahe",
+    "cloud_colors": "mapstream.operators.images.cloud_colors:CloudColors",
     "cloud_sink": "mapstream.operators.sinks.cloud:CloudSink",
     "compress_descriptors": "mapstream.operators.features.compress_descriptors:CompressDescriptors",
     "depth_registration": "mapstream.operators.images.depth_registration:DepthRegistration",
