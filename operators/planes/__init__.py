@@ -1,0 +1,1 @@
+"""Planes: found in depth and in clouds, followed as landmarks, and recognised in a map."""
