@@ -12,7 +12,7 @@ from mapstream.graph.cli.map.edit import anchor, edit
 from mapstream.graph.cli.map.files import export_, import_
 from mapstream.graph.cli.map.history import journal, redo, undo
 from mapstream.graph.cli.map.landmarks import add_verbs, optimize_visual
-from mapstream.graph.cli.map.look import check, stats, view
+from mapstream.graph.cli.map.look import check, cloud_quality, stats, view
 from mapstream.graph.cli.map.loops import close_loops, fix_stationary, loops
 from mapstream.graph.cli.map.parts import merge, remove
 from mapstream.graph.cli.map.places import summarize
@@ -31,6 +31,7 @@ def _folder(context: typer.Context, folder: Annotated[Path, typer.Argument(metav
 
 app.command("check")(check)
 app.command("stats")(stats)
+app.command("cloud-quality")(cloud_quality)
 app.command("view")(view)
 app.command("journal")(journal)
 app.command("undo")(undo)

@@ -8,6 +8,7 @@ from typing import Annotated
 import numpy as np
 import typer
 
+from mapstream.graph.cli.options import KeySetList, config_from
 from mapstream.graph.cli.output import (
     ExitCode,
     JsonFlag,
@@ -18,6 +19,7 @@ from mapstream.graph.cli.output import (
     say_json,
     say_table,
 )
+from mapstream.operators.maps.cloud_quality import CloudQualityConfig, map_cloud_quality
 from mapstream.operators.maps.statistics import map_statistics
 from mapstream.recordings.maps import check_map, load_map
 from mapstream.streams.arrays import FloatArray
@@ -41,6 +43,21 @@ def check(context: typer.Context, *, json: JsonFlag = False) -> None:
 def stats(context: typer.Context, *, json: JsonFlag = False) -> None:
     """Tell what is in the map: missions, lengths, edges, landmarks, files."""
     print_statistics(context.obj, json=json)
+
+
+def cloud_quality(
+    context: typer.Context, *, set_: KeySetList = None, json: JsonFlag = False
+) -> None:
+    """Tell how sharp the cloud of all keyframes is: of two maps of one place, the better one is sharper."""
+    folder: Path = context.obj
+    found = map_cloud_quality(load_map(folder), folder, config_from(CloudQualityConfig, set_))
+    if json:
+        say_json({"path": folder, **plain(found)})
+        return
+    say(
+        f"{in_place(folder)}: mean map entropy {found.entropy:.3f}, surfaces {1000 * found.plane_sigma_m:.1f} mm"
+    )
+    say(f"from {found.num_points} neighbourhoods; {found.num_lonely} points had too few neighbours")
 
 
 def print_statistics(folder: Path, *, json: bool) -> None:
