@@ -142,6 +142,11 @@ class LaserScan2D:
         n = frozen(self, "ranges_m", np.float32, (None,)).shape[0]
         frozen_optional(self, "intensity", np.float32, (n,))
 
+    @property
+    def end_ns(self) -> int:
+        """Time of the last beam."""
+        return self.stamp_ns + max(len(self.ranges_m) - 1, 0) * self.beam_period_ns
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class GnssFix:
