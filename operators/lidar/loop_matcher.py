@@ -20,15 +20,26 @@ class Gate:
     min_inlier_fraction: float
     max_rmse_m: float
     max_turn_rad: float  # away from the guess
+    max_sigma_m: float = np.inf  # of the position along its least certain direction
 
     def refusal(self, result: RegistrationResult, T_guess: SE3, max_shift_m: float) -> str | None:
         """Return why a match is not believed, or None if it is."""
+        return self.misfit(result) or self._too_far(result, T_guess, max_shift_m)
+
+    def misfit(self, result: RegistrationResult) -> str | None:
+        """Return why a match is not believed wherever it was expected, or None."""
         if not result.converged:
             return "the registration did not converge"
         if result.inlier_fraction < self.min_inlier_fraction:
             return f"inlier fraction {result.inlier_fraction:.2f} < {self.min_inlier_fraction:.2f}"
         if result.rmse_m > self.max_rmse_m:
             return f"rmse {result.rmse_m:.3f} m > {self.max_rmse_m:.3f} m"
+        sigma_m = float(np.sqrt(np.linalg.eigvalsh(result.covariance[3:, 3:])[-1]))
+        if sigma_m > self.max_sigma_m:
+            return f"nothing holds the position along one direction: sigma {sigma_m:.2f} m"
+        return None
+
+    def _too_far(self, result: RegistrationResult, T_guess: SE3, max_shift_m: float) -> str | None:
         moved = T_guess.inverse() @ result.T_target_source
         if np.linalg.norm(moved.t) > max_shift_m:
             return f"{np.linalg.norm(moved.t):.2f} m from the guess, more than {max_shift_m:.2f} m"

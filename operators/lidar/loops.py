@@ -6,17 +6,14 @@ from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import numpy as np
-from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
+from pydantic import NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
 
+from mapstream.operators.lidar.aligning import AligningConfig
 from mapstream.operators.lidar.loop_matcher import Gate, LoopMatcher
-from mapstream.operators.lidar.registration import (
-    Registration,
-    RegistrationResult,
-    make_registration,
-)
+from mapstream.operators.lidar.registration import RegistrationResult
 from mapstream.operators.lidar.surroundings import Surroundings
 from mapstream.operators.lidar.trail import Place, Reach, Trail
-from mapstream.operators.operator import Operator, OperatorConfig, Placement, offload, warn
+from mapstream.operators.operator import Operator, Placement, offload, warn
 from mapstream.streams.channel import Receiver, Sender
 from mapstream.streams.errors import EstimationError
 from mapstream.streams.messages.estimates import (
@@ -28,19 +25,9 @@ from mapstream.streams.messages.estimates import (
 )
 
 
-class LidarLoopsConfig(OperatorConfig):
+class LidarLoopsConfig(AligningConfig):
     """Options of `lidar_loops`."""
 
-    registration: str = "gicp"
-    """How clouds are aligned: icp, plane, gicp, vgicp, or an installed registration."""
-    registration_options: dict[str, Any] = Field(default_factory=dict)
-    """Options of an installed registration."""
-    voxel_size_m: PositiveFloat = 0.25
-    """Of the clouds that are aligned."""
-    search_distances_m: tuple[PositiveFloat, ...] = (1.0, 0.4)
-    """How far apart matching points may lie, coarse to fine."""
-    inlier_distance_m: PositiveFloat = 0.1
-    """How far from the surface a point may lie to count as an inlier."""
     min_keyframes: NonNegativeInt = 20
     """So many keyframes lie between the two ends of a loop."""
     min_path_m: NonNegativeFloat = 15.0
@@ -99,8 +86,8 @@ class LidarLoops(Operator[Inputs, Outputs]):
 
     def __init__(self, config: LidarLoopsConfig) -> None:
         self._config = config
-        self._fine = _registration(config, 1.0)
-        self._matcher = LoopMatcher(self._fine, _registration(config, 2.0), grid_m=1.5)
+        self._fine = config.make_registration()
+        self._matcher = LoopMatcher(self._fine, config.make_registration(2.0), grid_m=1.5)
         self._gate = Gate(
             min_inlier_fraction=config.min_inlier_fraction,
             max_rmse_m=config.max_rmse_m,
@@ -230,14 +217,3 @@ class LidarLoops(Operator[Inputs, Outputs]):
             source="lidar_loops",
             is_switchable=kind == "loop",
         )
-
-
-def _registration(config: LidarLoopsConfig, factor: float) -> Registration:
-    """Make the one that the config names, at a resolution."""
-    return make_registration(
-        config.registration,
-        config.registration_options,
-        leaf_size_m=factor * config.voxel_size_m,
-        search_distances_m=tuple(factor * d for d in config.search_distances_m),
-        inlier_distance_m=config.inlier_distance_m,
-    )

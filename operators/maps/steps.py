@@ -9,17 +9,28 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from importlib import import_module
-from typing import Any, ClassVar, TypeGuard, get_type_hints
+from inspect import signature
+from pathlib import Path
+from typing import Any, ClassVar, Protocol, TypeGuard, get_type_hints
 
+import anyio
 from pydantic import BaseModel, Field, ValidationError, model_validator
 
+from mapstream.operators.maps.passing_clouds import PassingClouds
 from mapstream.operators.operator import Operator, OperatorConfig, Placement, offload
 from mapstream.recordings.maps.combine import with_journal_entry
 from mapstream.recordings.maps.model import Map
 from mapstream.streams.channel import Receiver, Sender
+from mapstream.streams.messages.estimates import Submap
 
-Tool = Callable[[Map], tuple[Map, Any]]
-"""From a map to a new map and a report."""
+
+class Tool(Protocol):
+    """From a map to a new map and a report."""
+
+    def __call__(self, map_: Map, folder: Path | None = None) -> tuple[Map, Any]:
+        """Work on a map whose clouds are in a folder, where the tool needs them."""
+        ...
+
 
 TOOLS = {
     "anchor_missions": "mapstream.operators.places.anchoring:anchor_missions",
@@ -31,6 +42,7 @@ TOOLS = {
     "fix_stationary": "mapstream.operators.maps.stationary:fix_stationary",
     "keyframe": "mapstream.operators.maps.keyframing:keyframe",
     "optimize": "mapstream.operators.estimation.batch:optimize_map",
+    "register": "mapstream.operators.lidar.constraints.register:register",
     "remove_bad_landmarks": "mapstream.operators.landmarks.removal:remove_bad_landmarks",
     "remove_invalid_observations": "mapstream.operators.landmarks.removal:remove_invalid_observations",
     "reset_quality": "mapstream.operators.landmarks.quality:reset_quality",
@@ -74,6 +86,7 @@ class Inputs:
     """Maps as they grow, or one at the end."""
 
     maps: Receiver[Map]
+    submaps: Receiver[Submap] | None = None  # for tools that need the clouds of keyframes
 
 
 @dataclass(frozen=True)
@@ -93,19 +106,32 @@ class MapSteps(Operator[Inputs, Outputs]):
         self._steps = [(step, prepared(step)) for step in config.steps]
 
     async def run(self, inputs: Inputs, outputs: Outputs) -> None:
-        async for map_ in inputs.maps:
-            await outputs.maps.send(await offload(self.worked_on, map_))
+        with PassingClouds() as clouds:
+            async with anyio.create_task_group() as tasks:
+                if inputs.submaps is not None:
+                    tasks.start_soon(self._keep, inputs.submaps, clouds)
+                async for map_ in inputs.maps:
+                    if inputs.submaps is not None:
+                        await clouds.wait_for(map_)
+                    await outputs.maps.send(await offload(self.worked_on, map_, clouds))
 
-    def worked_on(self, map_: Map) -> Map:
+    async def _keep(self, submaps: Receiver[Submap], clouds: PassingClouds) -> None:
+        async for submap in submaps:
+            await offload(clouds.keep, submap)
+            clouds.tell()
+        clouds.end()
+
+    def worked_on(self, map_: Map, clouds: PassingClouds) -> Map:
         """Return the map after all steps.
 
         Raises:
             MappingError: If a tool refuses the map.
         """
+        map_ = clouds.put_into(map_)
         for step, tool in self._steps:
-            map_, _ = tool(map_)
+            map_, _ = tool(map_, clouds.folder)
             map_ = with_journal_entry(map_, step.tool, **step.config)
-        return map_
+        return clouds.taken_out(map_)
 
 
 def prepared(step: MapStep) -> Tool:
@@ -117,8 +143,14 @@ def prepared(step: MapStep) -> Tool:
     tool, config_type = loaded(step.tool)
     if config_type is None:
         OperatorConfig.model_validate(step.config)
-        return tool
-    return partial(tool, config=config_type.model_validate(step.config))
+    else:
+        tool = partial(tool, config=config_type.model_validate(step.config))
+    takes_folder = "folder" in signature(tool).parameters
+
+    def work(map_: Map, folder: Path | None = None) -> tuple[Map, Any]:
+        return tool(map_, folder=folder) if takes_folder else tool(map_)
+
+    return work
 
 
 def loaded(name: str) -> tuple[Callable[..., tuple[Map, Any]], type[BaseModel] | None]:

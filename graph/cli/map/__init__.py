@@ -12,10 +12,11 @@ from mapstream.graph.cli.map.edit import anchor, edit
 from mapstream.graph.cli.map.files import export_, import_
 from mapstream.graph.cli.map.history import journal, redo, undo
 from mapstream.graph.cli.map.landmarks import add_verbs, optimize_visual
-from mapstream.graph.cli.map.look import check, cloud_quality, stats, view
+from mapstream.graph.cli.map.look import check, cloud_quality, picture, stats, view
 from mapstream.graph.cli.map.loops import close_loops, fix_stationary, loops
 from mapstream.graph.cli.map.parts import merge, remove
 from mapstream.graph.cli.map.places import summarize
+from mapstream.graph.cli.map.registration import register
 from mapstream.graph.cli.map.solve import optimize, relax
 
 app = typer.Typer(
@@ -33,6 +34,7 @@ app.command("check")(check)
 app.command("stats")(stats)
 app.command("cloud-quality")(cloud_quality)
 app.command("view")(view)
+app.command("picture")(picture)
 app.command("journal")(journal)
 app.command("undo")(undo)
 app.command("redo")(redo)
@@ -48,6 +50,8 @@ app.command("align")(align)
 app.command("covariance")(covariance)
 app.command("close-loops")(close_loops)
 app.add_typer(loops, name="loops")
+app.command("register")(register)
+app.command("admc", hidden=True)(register)
 app.command("fix-stationary")(fix_stationary)
 app.command("anchor")(anchor)
 app.add_typer(edit, name="edit")

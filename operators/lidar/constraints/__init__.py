@@ -1,0 +1,1 @@
+"""Constraints from aligned clouds: between keyframes whose relative pose is roughly known."""
