@@ -44,6 +44,12 @@ class WLidConfig(BaseModel):
     """Length of the loop, once round."""
     overlap_fraction: NonNegativeFloat = 0.08
     """The part of the loop that is driven a second time."""
+    start_fraction: float = Field(default=0.0, ge=0.0, lt=1.0)
+    """Where on the loop the drive begins."""
+    reverse: bool = False
+    """The loop is driven the other way round."""
+    building: int | None = Field(default=None, ge=0)
+    """The seed whose corridors these are, so that several drives share them; null: the drive's own."""
     speed_mps: PositiveFloat = 3.2
     """Speed on the straight; corners are slower."""
     odometry_drift: NonNegativeFloat = 0.005
@@ -60,9 +66,11 @@ def w_lid(config: WLidConfig, seed: int) -> Simulation:
     """Return the recording of one drive; equal arguments give equal recordings.
 
     Topics: `/points`, `/imu`, `/odometry` (drifts) and `/truth`, the pose of the base in the world,
-    which is where the base starts.
+    which is where the base starts unless `start_fraction` or `reverse` says otherwise.
     """
     seeds = np.random.SeedSequence(seed).spawn(4)
+    if config.building is not None:
+        seeds[0] = np.random.SeedSequence(config.building).spawn(1)[0]
     world_rng, lidar_rng, imu_rng, odometry_rng = map(np.random.default_rng, seeds)
     ring = Ring(config.length_m)
     motion = drive(ring, config)
@@ -98,17 +106,18 @@ def _odometry(stamp_ns: int, T_world_base: FloatArray) -> Odometry:
 def drive(ring: Ring, config: WLidConfig) -> Motion:
     """Return the motion: a second at rest, gently off, and round the ring with the overlap."""
     distance_m = ring.length_m * (1 + config.overlap_fraction)
-    s_m = _distances(ring, distance_m, config.speed_mps)
+    driven_m = _distances(ring, distance_m, config)
+    s_m = _along(ring, driven_m, config)
     t_s = np.arange(len(s_m)) * _KNOT_NS / 1e9
     ramp = np.clip((t_s - _STAND_S) / _RAMP_S, 0, 1)
     moving = ramp * ramp * (3 - 2 * ramp)
-    sway = np.sin(2 * np.pi * s_m / 17.0)
+    sway = np.sin(2 * np.pi * driven_m / 17.0)
     positions = ring.points(s_m, 0.12 * sway, 0.004 * moving * np.sin(2 * np.pi * 1.7 * t_s))
     rpy_rad = np.stack(
         [
             0.005 * moving * np.sin(2 * np.pi * 0.9 * t_s),
             0.004 * moving * np.sin(2 * np.pi * 1.3 * t_s),
-            ring.headings(s_m) + 0.12 * np.sin(2 * np.pi * s_m / 17.0) * moving,
+            ring.headings(s_m) + np.pi * config.reverse + 0.12 * sway * moving,
         ],
         axis=1,
     )
@@ -118,15 +127,21 @@ def drive(ring: Ring, config: WLidConfig) -> Motion:
     return Motion(stamps_ns, positions, rpy_rad)
 
 
-def _distances(ring: Ring, distance_m: float, speed_mps: float) -> FloatArray:
+def _along(ring: Ring, driven_m: FloatArray, config: WLidConfig) -> FloatArray:
+    """Return the places on the ring [m] after distances from the start."""
+    return config.start_fraction * ring.length_m + (-driven_m if config.reverse else driven_m)
+
+
+def _distances(ring: Ring, distance_m: float, config: WLidConfig) -> FloatArray:
     """Return the distance driven at each knot [m]: from rest, slower in corners."""
     s, distances, t = 0.0, [], 0.0
     step_s = _KNOT_NS / 1e9
     ahead = np.linspace(-1.5, 1.5, 7)
     while s < distance_m:
         distances.append(s)
-        bend = float(np.mean(ring.curvature(np.array(s) + ahead))) * ring.radius_m
-        speed = speed_mps * (1 - (1 - _CORNER_SPEED) * bend)
+        near = _along(ring, s + ahead, config)
+        bend = float(np.mean(ring.curvature(near))) * ring.radius_m
+        speed = config.speed_mps * (1 - (1 - _CORNER_SPEED) * bend)
         start = np.clip((t - _STAND_S) / _RAMP_S, 0, 1)
         s += step_s * speed * start * start * (3 - 2 * start)
         t += step_s
