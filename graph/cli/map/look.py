@@ -123,3 +123,20 @@ def view(
     folder: Path = context.obj
     for note in view_map(load_map(folder), folder, SinkSpec.parse(rerun).open()):
         complain(note)
+
+
+def picture(
+    context: typer.Context,
+    file: Annotated[
+        Path, typer.Argument(help="A .png from above, or an .html to turn in a browser.")
+    ],
+    *,
+    set_: KeySetList = None,
+) -> None:
+    """Draw the map into a file, where there is no display for a viewer."""
+    from mapstream.graph.map_picture import PictureConfig, write_picture  # noqa: PLC0415
+
+    folder: Path = context.obj
+    for note in write_picture(load_map(folder), folder, file, config_from(PictureConfig, set_)):
+        complain(note)
+    say(f"wrote {in_place(file)}")
