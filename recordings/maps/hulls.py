@@ -48,8 +48,3 @@ def moved_hull(T_a_b: FloatArray, hull_m: FloatArray) -> FloatArray:
     """Return a hull (K, 2) of a pose b on a plane in x and y of another, a: what stands out is left out."""
     moved: FloatArray = hull_m @ T_a_b[:2, :2].T + T_a_b[:2, 3]
     return moved
-
-
-def joined_hulls(a_m: FloatArray, b_m: FloatArray) -> FloatArray:
-    """Return the convex hull of two."""
-    return convex_hull(np.concatenate([a_m, b_m]))

@@ -2,21 +2,27 @@
 
 In edges and in the table of landmarks a plane is a pose on it: z is its normal, the origin lies on it.
 Of the covariance the rotations about x and y and the translation along z count; the rest slides along it.
+A wall that a planar laser saw as a line along x has no rotation about it: its factor has two errors instead of three.
 Source: Trevor, Rogers, Christensen: Planar surface SLAM with 3D and 2D sensors, ICRA 2012.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from typing import Any
+
 import gtsam
 import numpy as np
 
+from mapstream.operators.estimation.factors.own_factor import OwnFactor, Residual
 from mapstream.operators.estimation.keys import key_of
 from mapstream.operators.estimation.noise import Factor, NoiseModels
 from mapstream.recordings.maps.model import Map
 from mapstream.streams.arrays import FloatArray, IntArray
-from mapstream.streams.geometry import so3_exp
+from mapstream.streams.geometry import hat, so3_exp
 
 _MEASURED = [0, 1, 5]  # of the tangent of a pose on the plane
+_AGAINST = np.diag([-1.0, 1.0])  # a turn about y takes the line out of the plane the other way
 
 
 def coefficients(T_frame_plane: FloatArray) -> FloatArray:
@@ -51,14 +57,50 @@ def seen(map_: Map, rows: IntArray, noise_of: NoiseModels) -> dict[int, Factor]:
     T_map_base = map_.T_map_base(edges.vertex_a[rows])
     known = coefficients(map_.T_map_landmark(edges.landmark_a[rows]))
     facing = np.einsum("ni,nij,nj->n", known[:, :3], T_map_base[:, :3, :3], measured[:, :3])
-    factors = {}
+    factors: dict[int, Factor] = {}
     for at, row in enumerate(rows.tolist()):
         covariance = edges.covariance[row][np.ix_(_MEASURED, _MEASURED)]
+        landmark = key_of("landmark", int(edges.landmark_a[row]))
+        if np.isinf(covariance[0, 0]) and np.isfinite(covariance[1:, 1:]).all():
+            ends = [int(edges.vertex_a[row]), landmark]
+            noise = noise_of(covariance[1:, 1:], _AGAINST)
+            factors[row] = OwnFactor(noise, ends, _line(edges.T_a_b[row]))
+            continue
         plane = measured[at] * (1.0 if facing[at] >= 0 else -1.0)
         noise = noise_of(covariance, _by_factor(edges.T_a_b[row], plane))
-        landmark = key_of("landmark", int(edges.landmark_a[row]))
         factors[row] = gtsam.OrientedPlane3Factor(plane, noise, int(edges.vertex_a[row]), landmark)
     return factors
+
+
+def _line(T_base_line: FloatArray) -> Residual:
+    """Return the residual of a line along x that lies in a plane: its slope against the plane, and its distance.
+
+    It is exact however far the plane is tilted about the line, as where a laser leans that looks at an upright wall.
+    """
+    along, p = T_base_line[:3, 0], T_base_line[:3, 3]
+    side = T_base_line[:3, 2]
+
+    def residual(
+        values: Any,  # noqa: ANN401
+        keys: Sequence[int],
+        jacobians: list[FloatArray] | None,
+    ) -> FloatArray:
+        pose, plane = values.atPose3(keys[0]), values.atOrientedPlane3(keys[1])
+        R, t = pose.rotation().matrix(), pose.translation()
+        unit, d = plane.normal(), plane.planeCoefficients()[3]
+        n = R.T @ unit.point3()  # in the base
+        sign = 1.0 if n @ side >= 0 else -1.0
+        if jacobians is not None:
+            by_pose, by_plane = np.zeros((2, 6)), np.zeros((2, 3))
+            by_pose[:, :3] = np.stack([along, p]) @ hat(n)
+            by_pose[1, 3:] = n
+            by_plane[:, :2] = np.stack([R @ along, R @ p + t]) @ unit.basis()
+            by_plane[1, 2] = 1.0
+            jacobians[0] = np.asfortranarray(sign * by_pose)
+            jacobians[1] = np.asfortranarray(sign * by_plane)
+        return sign * np.array([n @ along, n @ p + unit.point3() @ t + d])
+
+    return residual
 
 
 def _by_factor(T_base_plane: FloatArray, plane: FloatArray) -> FloatArray:

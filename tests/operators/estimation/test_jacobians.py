@@ -97,6 +97,21 @@ def seen(*kinds: str) -> Callable[[Map, np.ndarray], Map]:
     return build
 
 
+def wall_line(map_: Map, truth: np.ndarray) -> Map:
+    """A wall that a planar laser saw: nothing is known of its rotation about x."""
+    covariance = COVARIANCE.copy()
+    covariance[0, :] = covariance[:, 0] = 0.0
+    covariance[0, 0] = np.inf
+    made = Constraint(
+        stamp_ns=1,
+        kind="plane",
+        T_a_b=SE3.exp([0.3, 0.9, 0.2, 3.0, 1.0, 0.5]),
+        covariance=covariance,
+        landmark=LandmarkRef(name="wall", kind="plane"),
+    )
+    return with_constraints(map_, [made])
+
+
 def at_the_base(map_: Map, truth: np.ndarray) -> Map:
     """A point without a bearing."""
     ref = LandmarkRef(name="p")
@@ -134,6 +149,7 @@ BUILDERS = {
     "range": ranges,
     "landmarks": seen("point", "point2d", "pose", "visual"),
     "plane": seen("plane"),
+    "wall_line": wall_line,
     "at_the_base": at_the_base,
     "relations": relations,
     "imu": imu,

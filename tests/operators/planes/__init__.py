@@ -1,0 +1,1 @@
+"""Planes: found, followed, recognised."""
