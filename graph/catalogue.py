@@ -45,6 +45,7 @@ BUILT_IN = {
     "keypoint_depth": "mapstream.operators.tracking.keypoint_depth:KeypointDepth",
     "kiss_odometry": "mapstream.operators.odometry.kiss_odometry:KissOdometry",
     "klt": "mapstream.operators.tracking.klt:Klt",
+    "laser_lines": "mapstream.operators.laser.laser_lines:LaserLines",
     "lidar_loops": "mapstream.operators.lidar.loops:LidarLoops",
     "localize": "mapstream.operators.places.localize:Localize",
     "map_overlay": "mapstream.operators.images.map_overlay:MapOverlay",

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from mapstream.streams.messages.sensors import ImuBatch, LidarScan, Message
+from mapstream.streams.messages.sensors import ImuBatch, LaserScan2D, LidarScan, Message
 
 
 class Extent(NamedTuple):
@@ -20,6 +20,8 @@ def extent_of(message: Message) -> Extent:
     """Return when the content of a message begins and ends."""
     if isinstance(message, ImuBatch):
         return Extent(int(message.stamps_ns[0]), int(message.stamps_ns[-1]))
+    if isinstance(message, LaserScan2D):
+        return Extent(message.stamp_ns, message.end_ns)
     if (
         isinstance(message, LidarScan)
         and message.offsets_ns is not None
