@@ -137,6 +137,7 @@ class LaserScan2D:
     intensity: Float32Array | None = None  # (N,)
     frame: str = "laser"
     T_base_sensor: SE3 = field(default_factory=SE3.identity)
+    record: RecordRef | None = None
 
     def __post_init__(self) -> None:
         n = frozen(self, "ranges_m", np.float32, (None,)).shape[0]
