@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 
 _PATH = "map"
 _VOXEL_SIZE_M = 0.2  # a voxel of the cloud is a pixel or less where one sees a whole map
+_MAX_POINTS = 4_000_000  # of the cloud; a viewer with more of them is slow
 _FLUSH_S = 60.0
 _MAX_PICTURES = 500  # of one mission
 _PICTURES_AT_ONCE = 20
@@ -33,7 +34,7 @@ def view_map(
         map_: The map.
         folder: Its folder, with the clouds of its keyframes; None: without clouds.
         sink: Where it is drawn.
-        voxel_size_m: One point of the cloud is drawn per voxel.
+        voxel_size_m: One point of the cloud is drawn per voxel; voxels of a large map are larger.
 
     Raises:
         MapError: If no viewer answers, or the one that did takes nothing.
@@ -47,7 +48,9 @@ def view_map(
     drawing = [*view_of(map_)(map_, scene)]
     if folder is not None:
         try:
-            config = AggregateConfig(voxel_size_m=voxel_size_m, with_unanchored=True)
+            config = AggregateConfig(
+                voxel_size_m=voxel_size_m, with_unanchored=True, max_voxels=_MAX_POINTS
+            )
             drawing.append(cloud_entry(map_, aggregate_cloud(map_, folder, config), scene))
         except MapError as error:  # a map without clouds still has trajectories
             notes.append(f"rerun: the map is drawn without clouds: {error}")

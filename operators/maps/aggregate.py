@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
-from pydantic import PositiveFloat
+from pydantic import PositiveFloat, PositiveInt
 
 from mapstream.operators.lidar.sampling import voxel_keys
 from mapstream.operators.operator import OperatorConfig
@@ -27,6 +27,8 @@ class AggregateConfig(OperatorConfig):
     """One point is left per voxel, the mean of those in it."""
     with_unanchored: bool = False
     """Also missions whose place in the map is a guess."""
+    max_voxels: PositiveInt = 50_000_000
+    """A cloud of more gets voxels of twice the size, again and again, until it has no more: 100 bytes each."""
 
 
 def aggregate_cloud(map_: Map, folder: Path, config: AggregateConfig) -> PointCloud:
@@ -47,7 +49,7 @@ def aggregate_cloud(map_: Map, folder: Path, config: AggregateConfig) -> PointCl
     if not len(chosen):
         reason = "of missions whose place is known" if len(rows) else "at all"
         raise MapError(f"{folder}: there are no clouds {reason}; connect submaps to the map_store")
-    voxels = _Voxels(config.voxel_size_m)
+    voxels = _Voxels(config.voxel_size_m, config.max_voxels)
     poses = map_.T_map_base(resources.vertex[chosen])
     for row, T_map_base in zip(chosen.tolist(), poses, strict=True):
         cloud = read_cloud(folder / resources.path[row])
@@ -67,6 +69,7 @@ class _Voxels:
     """Sums of the points in each voxel; memory grows with the voxels, not with the points."""
 
     size_m: float
+    max_voxels: int
     keys: IntArray = field(default_factory=lambda: np.empty(0, dtype=np.int64))  # (V,) increasing
     sums: FloatArray = field(default_factory=lambda: np.empty((0, _NUM_SUMS)))
     _pending: list[FloatArray] = field(default_factory=list)
@@ -97,11 +100,17 @@ class _Voxels:
                 f"points lie beyond {reach_m:.0f} m of the map's origin; use larger voxels"
             )
         keys = np.concatenate([self.keys, voxel_keys(rows[:, :3], self.size_m)])
-        rows = np.concatenate([self.sums, rows])
+        self._pending, self._num_pending = [], 0
+        self._sum_up(keys, np.concatenate([self.sums, rows]))
+        while len(self.keys) > self.max_voxels:
+            self.size_m *= 2
+            middles = self.sums[:, :3] / self.sums[:, 4:5]
+            self._sum_up(voxel_keys(middles, self.size_m), self.sums)
+
+    def _sum_up(self, keys: IntArray, rows: FloatArray) -> None:
         self.keys, voxel = np.unique(keys, return_inverse=True)
         columns = [np.bincount(voxel, column, minlength=len(self.keys)) for column in rows.T]
         self.sums = np.column_stack(columns)
-        self._pending, self._num_pending = [], 0
 
     def means(self) -> tuple[FloatArray, FloatArray, npt.NDArray[np.uint8]]:
         """Return the mean points (V, 3), intensities (V,) and colours (V, 4), in the order of the voxels."""

@@ -113,6 +113,20 @@ def test_one_point_is_left_per_voxel(tmp_path: Path) -> None:
     assert len(np.unique(cells, axis=0)) == len(cells) <= 11 * 2 * 4
 
 
+def test_O11_a_cloud_of_too_many_voxels_gets_larger_ones(tmp_path: Path) -> None:
+    map_ = wall_map(tmp_path, np.tile(np.eye(4), (NUM_VERTICES, 1, 1)))
+    map_ = with_poses(map_, np.arange(NUM_VERTICES), np.eye(4))
+
+    fine = aggregate_cloud(map_, tmp_path, AggregateConfig(voxel_size_m=0.05))
+    bounded = aggregate_cloud(map_, tmp_path, AggregateConfig(voxel_size_m=0.05, max_voxels=200))
+    coarse = aggregate_cloud(map_, tmp_path, AggregateConfig(voxel_size_m=0.8))
+
+    assert len(fine.points) > 1000
+    assert 50 < len(bounded.points) <= 200
+    assert len(coarse.points) == len(bounded.points)
+    np.testing.assert_allclose(bounded.points, coarse.points, atol=1e-4)
+
+
 def test_missions_that_are_not_anchored_are_left_out(tmp_path: Path) -> None:
     map_ = wall_map(tmp_path, np.tile(np.eye(4), (NUM_VERTICES, 1, 1)))
     unknown = replace(map_.missions, is_base_frame_known=np.array([False]))
