@@ -18,6 +18,7 @@ from mapstream.graph.cli.map.parts import merge, remove
 from mapstream.graph.cli.map.places import summarize
 from mapstream.graph.cli.map.registration import register
 from mapstream.graph.cli.map.solve import optimize, relax
+from mapstream.graph.cli.map.surveys import elevation_, tiles
 
 app = typer.Typer(
     help="Work on a map: `mapstream map DIR COMMAND`.", no_args_is_help=True, rich_markup_mode=None
@@ -40,6 +41,9 @@ app.command("undo")(undo)
 app.command("redo")(redo)
 app.command("import")(import_)
 app.command("export")(export_)
+app.command("tiles")(tiles)
+app.command("elevation")(elevation_)
+app.command("elevation_mapping", hidden=True)(elevation_)
 app.command("optimize")(optimize)
 app.command("optvi", hidden=True)(optimize)
 app.command("optimize-visual")(optimize_visual)
