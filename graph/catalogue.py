@@ -60,6 +60,7 @@ BUILT_IN = {
     "odometry_guard": "mapstream.operators.odometry.odometry_guard:OdometryGuard",
     "optimizer": "mapstream.operators.backend.optimizer:Optimizer",
     "orb": "mapstream.operators.features.features:Orb",
+    "plane_landmarks": "mapstream.operators.planes.plane_landmarks:PlaneLandmarks",
     "plane_segmentation": "mapstream.operators.planes.plane_segmentation:PlaneSegmentation",
     "rectify": "mapstream.operators.images.rectify:Rectify",
     "resize": "mapstream.operators.images.resize:Resize",

@@ -61,7 +61,7 @@ def fitted(grid: DepthGrid, labels: Labels, count: int) -> ImagePlanes:
     sxx, sxy, syy = sums(wx * x), sums(wx * y), sums(wy * y)
     normal = np.stack([sxx, sxy, sx, sxy, syy, sy, sx, sy, one], axis=1).reshape(-1, 3, 3)
     right = np.stack([sums(wx * w), sums(wy * w), sums(weight * w)], axis=1)
-    q: FloatArray = np.linalg.solve(normal, right[:, :, None])[:, :, 0]
+    q = np.asarray(np.linalg.solve(normal, right[:, :, None])[:, :, 0], dtype=np.float64)
     num_pixels = np.bincount(label, minlength=count)
     off = q[label, 0] * x + q[label, 1] * y + q[label, 2] - w
     chi2 = sums(weight * off * off) / num_pixels

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+import numpy.typing as npt
 
 from mapstream.streams.arrays import BoolArray, Float32Array
 
@@ -80,4 +81,8 @@ def local_planes(grid: DepthGrid, *, window_px: int, step: int, most_chi2: float
     is_flat = (here.inverse_depth > 0) & (share >= _LEAST_KNOWN)
     is_flat &= off < most_chi2 * here.sigma * here.sigma
     fitted = w_mean + a * (here.x - x_mean) + b * (here.y - y_mean)
-    return LocalPlanes(*(each.astype(np.float32, copy=False) for each in (a, b, fitted)), is_flat)
+    return LocalPlanes(_float32(a), _float32(b), _float32(fitted), is_flat)
+
+
+def _float32(image: npt.NDArray[np.floating]) -> Float32Array:
+    return image.astype(np.float32, copy=False)

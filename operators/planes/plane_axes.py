@@ -36,6 +36,20 @@ def plane_covariance(T_frame_plane: FloatArray, information: FloatArray) -> Floa
     by_motion += np.outer(normal, d_by_motion) / d**2
     covariance = np.diag(np.full(6, np.inf))
     measured = np.ix_([0, 1, 5], [0, 1, 5])
-    inverse: FloatArray = np.linalg.inv(by_motion.T @ information @ by_motion)
+    inverse = np.linalg.inv(by_motion.T @ information @ by_motion).astype(np.float64)
     covariance[measured] = symmetric(inverse)
     return covariance
+
+
+def slid_onto(T_frame_plane: FloatArray, normal: FloatArray, point: FloatArray) -> FloatArray:
+    """Return a pose (4, 4) turned and shifted least, so that its z is a unit normal (3,) and a point (3,) is on its plane.
+
+    The normal is less than a right angle away from z.
+    """
+    z, x = normal, T_frame_plane[:3, 0]
+    x = x - (x @ z) * z
+    x = x / np.linalg.norm(x)
+    pose = T_frame_plane.copy()
+    pose[:3, :3] = np.column_stack([x, np.cross(z, x), z])
+    pose[:3, 3] -= (z @ (pose[:3, 3] - point)) * z
+    return pose

@@ -11,10 +11,11 @@ from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt
 from mapstream.operators.images.calibrated import require_camera
 from mapstream.operators.images.depth import depth_m_of
 from mapstream.operators.images.pinhole_maps import calibration_key
-from mapstream.operators.operator import Operator, OperatorConfig, Placement, pipeline
+from mapstream.operators.operator import Operator, OperatorConfig, Placement, offload, pipeline
 from mapstream.operators.planes.depth_planes import SegmentationLimits, depth_planes
 from mapstream.operators.planes.image_planes import ImagePlanes
 from mapstream.operators.planes.local_planes import DepthGrid
+from mapstream.operators.planes.period import Period
 from mapstream.operators.planes.plane_axes import plane_covariance, pose_on
 from mapstream.operators.planes.regions import Labels
 from mapstream.recordings.maps.hulls import convex_hull
@@ -30,6 +31,8 @@ from mapstream.streams.structured_light import depth_sigma_m
 class PlaneSegmentationConfig(OperatorConfig):
     """Options of `plane_segmentation`."""
 
+    period_s: NonNegativeFloat = 0.0
+    """The first image in each stretch of so long is looked at; 0: all are."""
     min_pixels: PositiveInt = 10_000
     """A smaller plane is none; for 640 x 480 px."""
     max_angle_deg: PositiveFloat = 2.0
@@ -76,6 +79,7 @@ class PlaneSegmentation(Operator[Inputs, Outputs]):
             window_px=config.window_px,
             min_pixels=config.min_pixels,
         )
+        self._period = Period(config.period_s)
         self._rays: tuple[object, Float32Array] | None = None
 
     async def run(self, inputs: Inputs, outputs: Outputs) -> None:
@@ -84,7 +88,14 @@ class PlaneSegmentation(Operator[Inputs, Outputs]):
             await outputs.planes.send(planes)
             await outputs.labels.send(labels)
 
-        await pipeline(self.segment, inputs.frames, send)
+        if not self._config.period_s:
+            await pipeline(self.segment, inputs.frames, send)
+            return
+        async for frame in inputs.frames:
+            if self._period.begins(frame.stamp_ns):
+                await send(await offload(self.segment, frame))
+            else:
+                outputs.planes.advance(frame.stamp_ns)
 
     def segment(self, frame: CameraFrame) -> tuple[PlaneSegments, CameraFrame]:
         """Return the planes of a depth image, and an image of their numbers.

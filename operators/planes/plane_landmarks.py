@@ -1,0 +1,173 @@
+"""Planes as landmarks: what several sensors see of them becomes measurements on the robot's poses."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+from pydantic import Field, NonNegativeFloat, PositiveFloat
+
+from mapstream.operators.operator import (
+    DynamicPorts,
+    Operator,
+    OperatorConfig,
+    Placement,
+    Ports,
+    offload,
+    report_loss,
+    warn,
+)
+from mapstream.operators.planes.known_planes import KnownPlanes, Reach
+from mapstream.operators.planes.period import Period
+from mapstream.operators.planes.seen_plane import SeenPlane
+from mapstream.operators.planes.whereabouts import Whereabouts
+from mapstream.recordings.maps.hulls import hull_payload
+from mapstream.streams.channel import Receiver, Sender
+from mapstream.streams.geometry import SE3
+from mapstream.streams.messages.constraints import Constraint, LandmarkRef
+from mapstream.streams.messages.estimates import MapCorrection, Odometry
+from mapstream.streams.messages.planes import PlaneSegments
+from mapstream.streams.sync import merge
+
+_SECOND_NS = 1_000_000_000
+
+
+class PlaneLandmarksConfig(OperatorConfig):
+    """Options of `plane_landmarks`: inputs are `odometry`, those under `inputs`, and `corrections`."""
+
+    inputs: tuple[str, ...] = ("planes",)
+    """Names of the inputs that get planes, one for each sensor."""
+    feedback_s: PositiveFloat | None = Field(
+        default=None,
+        description="with it there is an input `corrections`; each counts so long after its stamp, so that a "
+        "replay gives the same landmarks. It is longer than the submaps of the trajectory, which makes poses "
+        "all the time (period_s)",
+    )
+    period_s: NonNegativeFloat = 0.0
+    """Of each sensor one message in so long is used; 0: all are."""
+    max_angle_deg: PositiveFloat = 10.0
+    """Between a known plane and what is seen of it."""
+    max_distance_m: PositiveFloat = 0.6
+    """Of what is seen from the known plane."""
+    at_once: float = Field(
+        default=0.3,
+        gt=0,
+        le=1,
+        description="share of both that counts a moment after a plane was seen",
+    )
+    full_after_m: PositiveFloat = 5.0
+    """All of both counts after so much way without seeing the plane, for odometry drifts."""
+    min_overlap: float = Field(
+        default=0.1, ge=0, le=1, description="share of the smaller outline that lies on the other"
+    )
+    prefix: str = "plane"
+    """Of the names of planes; robots whose maps become one have different ones, if they begin at one time."""
+    is_switchable: bool = False
+    """An optimizer may find that a measurement is false."""
+
+
+@dataclass(frozen=True)
+class Outputs:
+    """One measurement for each plane seen, of kind `plane`."""
+
+    constraints: Sender[Constraint]
+
+
+class PlaneLandmarks(DynamicPorts, Operator[Ports, Outputs]):
+    """Recognise planes by where they are, and measure the robot's pose by them.
+
+    Lines of a planar laser and planes of a depth camera or of clouds share landmarks. Everything is decided by
+    stamps: in their order, at poses between two messages of the odometry.
+    """
+
+    placement: ClassVar[Placement] = "thread"
+
+    def __init__(self, config: PlaneLandmarksConfig) -> None:
+        self._config = config
+        reach = Reach(
+            angle_rad=float(np.deg2rad(config.max_angle_deg)),
+            distance_m=config.max_distance_m,
+            min_overlap=config.min_overlap,
+            at_once=config.at_once,
+            full_after_m=config.full_after_m,
+        )
+        self.known = KnownPlanes(reach, config.prefix)
+        self._where = Whereabouts(lost_m=config.full_after_m)
+        self._periods = [Period(config.period_s) for _ in config.inputs]
+        self._waiting: list[PlaneSegments] = []  # for the odometry of their time
+        self._heard: list[MapCorrection] = []  # that do not count yet
+        self._first_ns: int | None = None
+
+    @classmethod
+    def ports_for(cls, config: PlaneLandmarksConfig) -> tuple[dict[str, Any], dict[str, Any]]:
+        inputs: dict[str, Any] = dict.fromkeys(config.inputs, PlaneSegments)
+        inputs["odometry"] = Odometry
+        if config.feedback_s is not None:
+            inputs["corrections"] = MapCorrection
+        return inputs, {}
+
+    async def run(self, inputs: Ports, outputs: Outputs) -> None:
+        sensors = [inputs[name] for name in self._config.inputs]
+        async for port, message in merge(*sensors, inputs["odometry"]):
+            if isinstance(message, PlaneSegments):
+                if self._periods[port].begins(message.stamp_ns):
+                    self._waiting.append(message)
+                continue
+            if self._config.feedback_s is not None:
+                await self._hear(inputs["corrections"], message.stamp_ns)
+            for constraint in await offload(self.follow, message):
+                await outputs.constraints.send(constraint)
+            outputs.constraints.advance(message.stamp_ns)
+        for _ in self._waiting:
+            report_loss("planes seen before or after all odometry")
+
+    def follow(self, odometry: Odometry) -> list[Constraint]:
+        """Return the measurements up to a message of odometry."""
+        self._where.follow(odometry)
+        waiting, self._waiting = self._waiting, []
+        return [constraint for planes in waiting for constraint in self.measure(planes)]
+
+    def measure(self, planes: PlaneSegments) -> list[Constraint]:
+        """Return a measurement of each plane that a sensor saw between the last two messages of odometry."""
+        T_mission_base = self._where.note(planes.stamp_ns)
+        if T_mission_base is None:
+            report_loss("planes seen before or after all odometry")
+            return []
+        is_line = np.isinf(planes.covariances[:, 0, 0])
+        poses = T_mission_base @ planes.T_base_plane
+        pieces = [
+            SeenPlane(pose, hull, bool(line))
+            for pose, hull, line in zip(poses, planes.hulls_m, is_line, strict=True)
+        ]
+        names = self.known.see(planes.stamp_ns, pieces, T_mission_base, self._where.path_m)
+        return [self._constraint(planes, row, name) for row, name in enumerate(names)]
+
+    def _constraint(self, planes: PlaneSegments, row: int, name: str) -> Constraint:
+        return Constraint(
+            stamp_ns=planes.stamp_ns,
+            kind="plane",
+            T_a_b=SE3(planes.T_base_plane[row]),
+            covariance=planes.covariances[row],
+            landmark=LandmarkRef(name=name, kind="plane"),
+            payload=hull_payload(planes.hulls_m[row]),
+            is_switchable=self._config.is_switchable,
+            source=f"plane_landmarks {planes.frame}",
+        )
+
+    async def _hear(self, corrections: Receiver[MapCorrection], stamp_ns: int) -> None:
+        """Take the corrections over that count at a stamp; wait for those that may still come."""
+        if self._first_ns is None:
+            self._first_ns = stamp_ns
+        counts_ns = stamp_ns - round((self._config.feedback_s or 0.0) * _SECOND_NS)
+        while counts_ns >= self._first_ns and not (
+            self._heard and self._heard[-1].stamp_ns > counts_ns
+        ):
+            correction = await anext(aiter(corrections), None)
+            if correction is None:
+                warn("the optimizer's corrections ended; planes are followed by odometry")
+                return
+            self._heard.append(correction)
+        while self._heard and self._heard[0].stamp_ns <= counts_ns:
+            self._where.correct(self._heard.pop(0))
+            self.known.move(self._where.at)
