@@ -35,12 +35,13 @@ from mapstream.graph.views.motion import (
     view_transforms,
     view_wheel_odometry,
 )
+from mapstream.graph.views.planes import view_plane_segments
 from mapstream.graph.views.run import operator_graph, view_snapshot
 from mapstream.graph.views.scene import Columns, Entry, Scene, View, ViewSettings
 from mapstream.graph.views.tracks import view_image_features, view_n_frame
 from mapstream.graph.views.unknown import view_unknown
 from mapstream.recordings.maps import Map
-from mapstream.streams.messages import constraints, estimates, sensors, vision
+from mapstream.streams.messages import constraints, estimates, planes, sensors, vision
 
 __all__ = [
     "GROUP",
@@ -72,6 +73,7 @@ _BUILT_IN: dict[type, View] = {
     estimates.LoopReport: view_loop_report,
     estimates.MapCorrection: view_map_correction,
     estimates.MapPose: view_map_pose,
+    planes.PlaneSegments: view_plane_segments,
     vision.ImageFeatures: view_image_features,
     vision.NFrame: view_n_frame,
     Map: view_map,

@@ -2,22 +2,20 @@
 
 from __future__ import annotations
 
-import json
-
 import numpy as np
 import rerun as rr
 
 from mapstream.graph.views.colors import AXES, ramp_colors
 from mapstream.graph.views.growing import MAP_PATH
+from mapstream.graph.views.planes import PLANE, drawn
 from mapstream.graph.views.scene import Entry
 from mapstream.recordings.maps import Map
+from mapstream.recordings.maps.hulls import hull_of
 from mapstream.streams.arrays import FloatArray, IntArray
 
-_PLANE = 0x56B4E9FF
-_SURFACE = 0x56B4E940  # one sees through it
 _AXIS_M = 0.3
 _SIDE_M = 1.0  # of a plane without a boundary
-_SQUARE = _SIDE_M / 2 * np.array([[-1.0, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])
+_SQUARE = _SIDE_M / 2 * np.array([[-1.0, -1], [1, -1], [1, 1], [-1, 1]])
 
 
 def landmark_entries(map_: Map) -> list[Entry]:
@@ -55,35 +53,9 @@ def _marks(map_: Map, rows: IntArray, path: str) -> list[Entry]:
 
 
 def _planes(map_: Map, rows: IntArray, path: str) -> list[Entry]:
-    """Return the boundaries of planes, and their surfaces, which are convex."""
-    strips, vertices, triangles, first = [], [], [], 0
-    for row, T in zip(rows.tolist(), map_.T_map_landmark(rows), strict=True):
-        corners = _hull(map_.landmarks.payload[row]) @ T[:3, :3].T + T[:3, 3]
-        strips.append(np.concatenate([corners, corners[:1]]))
-        vertices.append(corners)
-        fan = np.arange(1, len(corners) - 1)
-        triangles.append(first + np.column_stack([np.zeros_like(fan), fan, fan + 1]))
-        first += len(corners)
+    """Return the outlines of planes, a square where one has none, and their surfaces."""
+    hulls = [hull_of(map_.landmarks.payload[row]) for row in rows]
+    hulls = [hull if len(hull) >= 2 else _SQUARE for hull in hulls]
     labels = map_.landmarks.label[rows].tolist()
-    surface = rr.Mesh3D(
-        vertex_positions=np.concatenate(vertices).astype(np.float32),
-        triangle_indices=np.concatenate(triangles),
-        albedo_factor=_SURFACE,
-    )
-    boundaries = rr.LineStrips3D(
-        strips,
-        colors=_PLANE,
-        radii=rr.Radius.ui_points(1.5),
-        labels=labels if any(labels) else None,
-    )
+    boundaries, surface = drawn(map_.T_map_landmark(rows), hulls, [PLANE] * len(rows), labels)
     return [Entry.of(path, boundaries), Entry.of(f"{path}/surface", surface)]
-
-
-def _hull(payload: bytes) -> FloatArray:
-    """Return the corners (N, 3) of a plane in its own frame; a square where the payload names none."""
-    try:
-        corners = np.array(json.loads(payload)["hull"], dtype=np.float64)
-    except (ValueError, KeyError, TypeError):
-        return _SQUARE
-    is_area = corners.ndim == 2 and corners.shape[1:] == (3,) and len(corners) >= 3
-    return corners if is_area and np.isfinite(corners).all() else _SQUARE

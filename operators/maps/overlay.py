@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 
 import numpy as np
 
 from mapstream.recordings.maps.cameras import Camera
+from mapstream.recordings.maps.hulls import hull_of
 from mapstream.recordings.maps.model import Map
 from mapstream.streams.arrays import BoolArray, FloatArray, IntArray
 from mapstream.streams.camera_models import project
@@ -64,9 +64,10 @@ def _inside(camera: Camera, p_camera: FloatArray) -> tuple[FloatArray, BoolArray
 
 def _outline(payload: bytes) -> FloatArray:
     """Return points (N, 3) along the closed boundary of a plane, in its frame; none where it has no hull."""
-    corners = np.array(json.loads(payload or b"{}").get("hull", []), dtype=np.float64)
-    if len(corners) < 2:
+    hull = hull_of(payload)
+    if len(hull) < 2:
         return np.empty((0, 3))
+    corners = np.column_stack([hull, np.zeros(len(hull))])
     sides = np.stack([corners, np.roll(corners, -1, axis=0)], axis=1)
     return np.concatenate(
         [

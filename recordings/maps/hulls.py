@@ -40,8 +40,8 @@ def hull_of(payload: bytes) -> FloatArray:
         hull = np.array(json.loads(payload or b"{}")["hull"], dtype=np.float64)
     except (ValueError, KeyError, TypeError):
         return np.empty((0, 2))
-    is_hull = hull.ndim == 2 and hull.shape[1] == 2 and bool(np.isfinite(hull).all())
-    return hull if is_hull else np.empty((0, 2))
+    is_hull = hull.ndim == 2 and hull.shape[1] in (2, 3) and bool(np.isfinite(hull).all())
+    return hull[:, :2] if is_hull else np.empty((0, 2))
 
 
 def moved_hull(T_a_b: FloatArray, hull_m: FloatArray) -> FloatArray:

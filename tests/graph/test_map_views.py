@@ -20,7 +20,7 @@ from tests.graph.rrd import read_rrd, strict, values_of
 
 def test_P1_planes_objects_and_outer_frames_are_entities_of_their_own(tmp_path: Path) -> None:
     """A wall with its boundary, one without, a chair with axes, and a fix in a known frame."""
-    wall = {"hull": [[0, 0, 0], [2, 0, 0], [2, 1, 0], [1, 2, 0], [0, 1, 0]]}
+    wall = {"hull": [[0, 0], [2, 0], [2, 1], [1, 2], [0, 1]]}
     map_ = made.made_map()
     landmarks = Landmarks(
         id=id_array(derived_id("landmark", n) for n in range(3)),

@@ -34,8 +34,8 @@ def test_P6_the_outline_of_a_plane_is_cut_where_the_image_ends() -> None:
     map_ = seen_map({"left": ("none", [])})
     camera = cameras_of(map_, 0)["left"]
     T_base_wall = camera.T_base_sensor @ SE3.exp([0, 0, 0, 0, 0, 10.0])
-    hull = [[-1.0, -1.0, 0.0], [1.0, -1.0, 0.0], [1.0, 1.0, 0.0], [-1.0, 1.0, 0.0]]
-    wide = [[-20.0, -1.0, 0.0], [20.0, -1.0, 0.0], [20.0, 1.0, 0.0], [-20.0, 1.0, 0.0]]
+    hull = [[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]]
+    wide = [[-20.0, -1.0], [20.0, -1.0], [20.0, 1.0], [-20.0, 1.0]]
     planes = Landmarks(
         id=id_array(derived_id("plane", n) for n in range(2)),
         kind=np.array(["plane", "plane"], dtype=object),
