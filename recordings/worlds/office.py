@@ -12,9 +12,10 @@ from mapstream.recordings.worlds.mesh import Mesh, box, join
 from mapstream.streams.arrays import BoolArray, FloatArray, frozen
 from mapstream.streams.geometry import SE3, so3_exp
 
-CORRIDOR_M = 2.0  # width
-ROOM_M = 4.5  # depth of the outer rooms
-CORE_M = 4.0  # depth of the rooms within the ring
+# no multiples of the cells of a grid, as in a real building
+CORRIDOR_M = 2.03  # width
+ROOM_M = 4.51  # depth of the outer rooms
+CORE_M = 4.04  # depth of the rooms within the ring
 DEPTH_M = 2 * ROOM_M + 2 * CORRIDOR_M + CORE_M
 MIN_WIDTH_M = 14.0
 DOOR_M = 1.0

@@ -97,13 +97,13 @@ def _on_the_way(floor: Office, start: tuple[float, float], end: tuple[float, flo
 
 
 def _visit(room: Room, heading: float, rng: np.random.Generator) -> Iterator[_STATION]:
-    """Yield the way to the middle of a room and back; the robot turns as it likes."""
+    """Yield the way to the middle of a room and back; the robot looks to one side, then to the other."""
     middle = sum(room.y_m) / 2
-    turn = heading + rng.uniform(-1.5, 1.5)
+    turn = rng.choice([-1, 1]) * rng.uniform(0.8, 1.5)
     yield room.door_m, room.corridor_m, heading
-    yield room.door_m, room.wall_m, (heading + turn) / 2
-    yield room.door_m, middle, turn
-    yield room.door_m, room.wall_m, (heading + turn) / 2
+    yield room.door_m, room.wall_m, heading + turn / 2
+    yield room.door_m, middle, heading + turn
+    yield room.door_m, room.wall_m, heading - turn
     yield room.door_m, room.corridor_m, heading
 
 
