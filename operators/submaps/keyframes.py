@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Sequence
 from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
 
 import numpy as np
 from pydantic import Field, PositiveFloat
@@ -14,9 +15,12 @@ from mapstream.operators.submaps.records import records_of
 from mapstream.streams.arrays import FloatArray
 from mapstream.streams.channel import Receiver, Sender
 from mapstream.streams.errors import EstimationError
+from mapstream.streams.join import Join
 from mapstream.streams.messages.estimates import Keyframe, Odometry, PointCloud
+from mapstream.streams.messages.sensors import CameraFrame
 from mapstream.streams.messages.vision import NFrame
-from mapstream.streams.sync import exact
+from mapstream.streams.sync import anchored, exact, nearest
+from mapstream.streams.takes import Take
 from mapstream.streams.triggers import AnyOf, OnMotion, Periodic, Trigger
 
 
@@ -32,15 +36,19 @@ class KeyframesConfig(OperatorConfig):
     odometry_sigma_rad: PositiveFloat = 0.002
     """Uncertainty of a step where the odometry says nothing."""
     odometry_sigma_m: PositiveFloat = 0.01
+    images_apart_s: PositiveFloat = 0.02
+    """So far an image, or a depth image, may be from the keyframe that refers to it."""
 
 
 @dataclass(frozen=True)
 class Inputs:
-    """Odometry, and the clouds and n-frames that have its stamps."""
+    """Odometry, and the clouds and n-frames that have its stamps; images near them, which the map refers to."""
 
     odometry: Receiver[Odometry]
     clouds: Receiver[PointCloud] | None
     n_frames: Receiver[NFrame] | None
+    frames: Receiver[CameraFrame] | None
+    depth: Receiver[CameraFrame] | None
 
 
 @dataclass(frozen=True)
@@ -71,14 +79,15 @@ class Keyframes(Operator[Inputs, Outputs]):
     async def run(self, inputs: Inputs, outputs: Outputs) -> None:
         waiting: Keyframe | None = None  # the newest moment, not kept so far
         num_unknown = 0
-        async for odometry, cloud, n_frame in _moments(inputs):
+        within_ns = round(self._config.images_apart_s * 1e9)
+        async for odometry, cloud, n_frame, images in _moments(inputs, within_ns):
             if self._previous is None and odometry.is_lost:
                 num_unknown += 1
                 continue
             if self._previous is not None and odometry.stamp_ns <= self._previous.stamp_ns:
                 report_loss("moments whose stamp does not increase")
                 continue
-            keyframe = self.moment(odometry, cloud, n_frame)
+            keyframe = self.moment(odometry, cloud, n_frame, images)
             waiting = keyframe
             pose = (odometry.stamp_ns, odometry.T_odom_base)
             if self._trigger.is_due(*pose) or self._overlap.is_lost(keyframe.features):
@@ -96,7 +105,11 @@ class Keyframes(Operator[Inputs, Outputs]):
             )
 
     def moment(
-        self, odometry: Odometry, cloud: PointCloud | None, n_frame: NFrame | None = None
+        self,
+        odometry: Odometry,
+        cloud: PointCloud | None,
+        n_frame: NFrame | None = None,
+        images: Sequence[CameraFrame] = (),
     ) -> Keyframe:
         """Return the keyframe that this moment would be."""
         if self._previous is None:
@@ -116,7 +129,7 @@ class Keyframes(Operator[Inputs, Outputs]):
             stamp_ns=odometry.stamp_ns,
             odometry=since_kept,
             cloud=cloud,
-            records=records_of(cloud, features),
+            records=records_of(cloud, features, images),
             features=features,
         )
 
@@ -128,14 +141,29 @@ def _trigger(config: KeyframesConfig) -> Trigger:
     return AnyOf(triggers)
 
 
-async def _moments(
-    inputs: Inputs,
-) -> AsyncIterator[tuple[Odometry, PointCloud | None, NFrame | None]]:
-    """Yield odometry with the cloud and the n-frame of its stamp, as far as they are connected."""
-    connected = [r for r in (inputs.odometry, inputs.clouds, inputs.n_frames) if r is not None]
-    moments = exact(*connected)
-    async for odometry, *seen in moments:
-        cloud = seen[0] if inputs.clouds is not None else None
-        yield odometry, cloud, seen[-1] if inputs.n_frames is not None else None
-    if moments.stats.unmatched:
+async def _moments(inputs: Inputs, within_ns: int) -> AsyncIterator[_Moment]:
+    """Yield odometry with the cloud and the n-frame of its stamp and images near it, as far as they are connected."""
+    with_stamp = [r for r in (inputs.clouds, inputs.n_frames) if r is not None]
+    images = [nearest(r, within_ns, optional=True) for r in (inputs.frames, inputs.depth)]
+    moments: Join[tuple[Any, ...]] = exact(inputs.odometry, *with_stamp)
+    if inputs.frames is not None or inputs.depth is not None:
+        at_stamp: list[Take[Any]] = [nearest(receiver, 0) for receiver in with_stamp]
+        moments = anchored(inputs.odometry, *at_stamp, *images)
+    num_seen = len(with_stamp)
+    async for odometry, *found in moments:
+        seen, near = found[:num_seen], found[num_seen:]
+        yield _Moment(
+            odometry,
+            seen[0] if inputs.clouds is not None else None,
+            seen[-1] if inputs.n_frames is not None else None,
+            [image for image in near if image is not None],
+        )
+    if moments.stats.unmatched or moments.stats.absent:
         warn(moments.explain())
+
+
+class _Moment(NamedTuple):
+    odometry: Odometry
+    cloud: PointCloud | None
+    n_frame: NFrame | None
+    images: list[CameraFrame]
