@@ -69,6 +69,23 @@ operators:
   odometry: {use: visual_odometry, in: {n_frames: n_frames.n_frames}, run: inline}
   path: {use: trajectory_sink, in: {odometry: odometry.odometry}, config: {path: OUT}}
 """
+DENSE = """
+version: 1
+name: dense
+operators:
+  sensors:
+    use: mcap
+    config: {path: RECORDING, topics: {color: /color/image, depth: /depth/image}, end_s: 1.99}
+  color: {use: image_decode, in: {images: sensors.color}}
+  depth: {use: image_decode, in: {images: sensors.depth}, config: {mode: depth}}
+  registered: {use: depth_registration, in: {depth: depth.frames, frames: color.frames}}
+  odometry:
+    use: dense_visual_odometry
+    in: {frames: color.frames, depth: registered.depth}
+    config: {width_px: 160}
+    run: inline
+  path: {use: trajectory_sink, in: {odometry: odometry.odometry}, config: {path: OUT}}
+"""
 MONO = """
 version: 1
 name: mono
@@ -195,13 +212,17 @@ async def test_a_real_street_in_stereo(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-async def test_a_real_kitchen_in_colour_and_depth(tmp_path: Path) -> None:
+@pytest.mark.parametrize(("graph", "count", "bar_m"), [(DEPTH, 150, 0.06), (DENSE, 60, 0.01)])
+async def test_C8_a_real_kitchen_in_colour_and_depth(
+    tmp_path: Path, graph: str, count: int, bar_m: float
+) -> None:
+    """Whole images are 0.014 m off over all 150; features with PnP 0.107 m, over 600."""
     folder = shared("redkitchen_rgbd")
     recording = convert(f"7scenes:{folder}", tmp_path / "in.mcap").path
-    poses = [np.loadtxt(folder / f"frame-{k:06d}.pose.txt") for k in range(150)]
+    poses = [np.loadtxt(folder / f"frame-{k:06d}.pose.txt") for k in range(count)]
 
-    found = await run(DEPTH, recording, tmp_path)
+    found = await run(graph, recording, tmp_path)
 
-    assert len(found) == 150
+    assert len(found) == count
     pairs = PosePairs(stamps_ns=found.stamps_ns, estimate=found.poses, reference=np.array(poses))
-    assert ape(pairs).translation.rmse < 0.06
+    assert ape(pairs).translation.rmse < bar_m

@@ -1,0 +1,1 @@
+"""Odometry by comparing whole images of colour and depth."""
