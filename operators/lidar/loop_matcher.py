@@ -69,6 +69,14 @@ class LoopMatcher:
         tried = [self._coarse.align(source, target, T) for T in self._starts(T_guess, radius_m)]
         return self._fine.align(source, target, max(tried, key=score).T_target_source)
 
+    def refine(self, source: Points, target: Points, T_guess: SE3) -> RegistrationResult:
+        """Find T_target_source close to the guess.
+
+        Raises:
+            EstimationError: If one of the clouds is too small to be registered.
+        """
+        return self._fine.align(source, target, T_guess)
+
     def _starts(self, T_guess: SE3, radius_m: float) -> list[SE3]:
         starts = [T_guess]
         for ring in range(1, min(int(radius_m / self._grid_m), _MAX_RINGS) + 1):

@@ -3,57 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, ClassVar
-
-import numpy as np
-from pydantic import NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
+from typing import ClassVar
 
 from mapstream.operators.lidar.aligning import AligningConfig
-from mapstream.operators.lidar.loop_matcher import Gate, LoopMatcher
-from mapstream.operators.lidar.registration import RegistrationResult
-from mapstream.operators.lidar.surroundings import Surroundings
-from mapstream.operators.lidar.trail import Place, Reach, Trail
-from mapstream.operators.operator import Operator, Placement, offload, warn
+from mapstream.operators.lidar.loop_matcher import LoopMatcher
+from mapstream.operators.lidar.loop_search import LoopSearch, LoopSearchConfig
+from mapstream.operators.operator import Operator, Placement
 from mapstream.streams.channel import Receiver, Sender
-from mapstream.streams.errors import EstimationError
-from mapstream.streams.messages.estimates import (
-    LoopCandidate,
-    LoopReport,
-    MapCorrection,
-    RelativePose,
-    Submap,
-)
+from mapstream.streams.messages.estimates import LoopReport, MapCorrection, Submap
 
 
-class LidarLoopsConfig(AligningConfig):
+class LidarLoopsConfig(LoopSearchConfig, AligningConfig):
     """Options of `lidar_loops`."""
-
-    min_keyframes: NonNegativeInt = 20
-    """So many keyframes lie between the two ends of a loop."""
-    min_path_m: NonNegativeFloat = 15.0
-    """So much path lies between the two ends of a loop."""
-    max_distance_m: PositiveFloat = 3.0
-    """How far apart the two ends may be by the poses known before."""
-    drift: NonNegativeFloat = 0.01
-    """By so much per metre travelled since a loop closed, `max_distance_m` grows."""
-    spacing_m: PositiveFloat = 2.0
-    """Path between two searches."""
-    neighbours: NonNegativeInt = 4
-    """Keyframes on either side whose clouds are merged."""
-    min_inlier_fraction: PositiveFloat = 0.6
-    """Of the points, for a match to be believed."""
-    max_rmse_m: PositiveFloat = 0.06
-    """Of the inliers, for a match to be believed."""
-    max_turn_deg: PositiveFloat = 25.0
-    """How far a match may turn away from the poses known before."""
-    sigma_rotation_rad: PositiveFloat = 0.005
-    """Uncertainty that every loop has beyond what the registration claims."""
-    sigma_translation_m: PositiveFloat = 0.03
-    """The same of the position."""
-    links: tuple[PositiveInt, ...] = ()
-    """Also register each keyframe to those so many before it, for instance `[1, 2]`."""
-    max_cloud_bytes: PositiveInt = 128_000_000
-    """Memory for clouds; all of them are on disk."""
 
 
 @dataclass(frozen=True)
@@ -85,135 +46,8 @@ class LidarLoops(Operator[Inputs, Outputs]):
     spans_epochs: ClassVar[bool] = True
 
     def __init__(self, config: LidarLoopsConfig) -> None:
-        self._config = config
-        self._fine = config.make_registration()
-        self._matcher = LoopMatcher(self._fine, config.make_registration(2.0), grid_m=1.5)
-        self._gate = Gate(
-            min_inlier_fraction=config.min_inlier_fraction,
-            max_rmse_m=config.max_rmse_m,
-            max_turn_rad=float(np.radians(config.max_turn_deg)),
-        )
-        self._reach = Reach(
-            min_keyframes=config.min_keyframes,
-            min_path_m=config.min_path_m,
-            distance_m=config.max_distance_m,
-            drift=config.drift,
-        )
-        self._trails: dict[str, Trail] = {}  # by mission
-        self._searched_m: dict[str, float] = {}  # by mission: where on the path was searched last
+        fine, coarse = config.make_registration(), config.make_registration(2.0)
+        self._search = LoopSearch(config, LoopMatcher(fine, coarse, grid_m=1.5), "lidar_loops")
 
     async def run(self, inputs: Inputs, outputs: Outputs) -> None:
-        newest_ns: dict[str, int] = {}
-        with Surroundings(self._config.neighbours, self._config.max_cloud_bytes) as surroundings:
-            async for submap in inputs.submaps:
-                before_ns = newest_ns.get(submap.mission_id)
-                if inputs.corrections is not None and before_ns is not None:
-                    await self._hear(inputs.corrections, submap.mission_id, before_ns)
-                newest_ns[submap.mission_id] = submap.stamp_ns
-                report = await offload(self.search, submap, surroundings)
-                await outputs.loops.send(report)
-
-    async def _hear(
-        self, corrections: Receiver[MapCorrection], mission_id: str, stamp_ns: int
-    ) -> None:
-        """Wait for the poses that the optimizer had after the submap that ended at this stamp."""
-        async for correction in corrections:
-            self._trails[correction.mission_id].correct(correction)
-            if correction.mission_id == mission_id and correction.stamp_ns >= stamp_ns:
-                return
-        warn("the optimizer's corrections ended; loops are searched by odometry")
-
-    def search(self, submap: Submap, surroundings: Surroundings) -> LoopReport:
-        """Look for loops from the new keyframes of one submap."""
-        mission_id = submap.mission_id
-        trail = self._trails.setdefault(mission_id, Trail())
-        surroundings.keep(submap)
-        edges: list[RelativePose] = []
-        candidates: list[LoopCandidate] = []
-        for index in trail.extend(submap):
-            edges += self._links(mission_id, trail, index, surroundings)
-            path_m = trail.path_m(index)
-            if path_m - self._searched_m.get(mission_id, -np.inf) < self._config.spacing_m:
-                continue
-            place = trail.seen_before(index, self._reach)
-            if place is None:
-                continue
-            self._searched_m[mission_id] = path_m
-            edge, candidate = self._try(mission_id, trail, index, place, surroundings)
-            candidates.append(candidate)
-            edges += [] if edge is None else [edge]
-        return LoopReport(
-            stamp_ns=submap.stamp_ns, edges=tuple(edges), candidates=tuple(candidates)
-        )
-
-    def _try(
-        self, mission_id: str, trail: Trail, index: int, place: Place, surroundings: Surroundings
-    ) -> tuple[RelativePose | None, LoopCandidate]:
-        """Register a keyframe to a place, and judge the match."""
-        T_guess = trail.pose(place.index).inverse() @ trail.pose(index)
-        result: RegistrationResult | None = None
-        try:
-            target = surroundings.around(mission_id, trail, place.index)
-            source = surroundings.around(mission_id, trail, index)
-            result = self._matcher.match(source, target, T_guess, place.reach_m)
-            refusal = self._gate.refusal(result, T_guess, 2 * place.reach_m)
-        except EstimationError as error:
-            refusal = str(error)
-        candidate = LoopCandidate(
-            stamp_a_ns=int(trail.stamps_ns[place.index]),
-            stamp_b_ns=int(trail.stamps_ns[index]),
-            distance_m=place.distance_m,
-            verdict=refusal or "accepted",
-            inlier_fraction=float("nan") if result is None else result.inlier_fraction,
-            rmse_m=float("nan") if result is None else result.rmse_m,
-        )
-        if refusal or result is None:
-            return None, candidate
-        trail.close(index)
-        return self._edge("loop", mission_id, trail, (place.index, index), result), candidate
-
-    def _links(
-        self, mission_id: str, trail: Trail, index: int, surroundings: Surroundings
-    ) -> list[RelativePose]:
-        """Register a keyframe to the ones before it that the config names."""
-        edges = []
-        for link in self._config.links:
-            if index < link:
-                continue
-            T_guess = trail.pose(index - link).inverse() @ trail.pose(index)
-            try:
-                target = surroundings.at(mission_id, trail, index - link)
-                source = surroundings.at(mission_id, trail, index)
-                result = self._fine.align(source, target, T_guess)
-                refusal = self._gate.refusal(result, T_guess, self._config.max_distance_m)
-            except EstimationError as error:
-                warn(f"a keyframe is not registered to one before it: {error}")
-                continue
-            if refusal:
-                warn("a keyframe is not registered to one before it: the match was not believed")
-            else:
-                ends = (index - link, index)
-                edges.append(self._edge("registration", mission_id, trail, ends, result))
-        return edges
-
-    def _edge(
-        self,
-        kind: Any,  # noqa: ANN401  # a literal
-        mission_id: str,
-        trail: Trail,
-        ends: tuple[int, int],
-        result: RegistrationResult,
-    ) -> RelativePose:
-        config = self._config
-        floor = np.array([config.sigma_rotation_rad] * 3 + [config.sigma_translation_m] * 3)
-        return RelativePose(
-            kind=kind,
-            mission_a=mission_id,
-            stamp_a_ns=int(trail.stamps_ns[ends[0]]),
-            mission_b=mission_id,
-            stamp_b_ns=int(trail.stamps_ns[ends[1]]),
-            T_a_b=result.T_target_source,
-            covariance=result.covariance + np.diag(floor**2),
-            source="lidar_loops",
-            is_switchable=kind == "loop",
-        )
+        await self._search.run(inputs.submaps, inputs.corrections, outputs.loops)
