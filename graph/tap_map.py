@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 _PATH = "map"
 _VOXEL_SIZE_M = 0.2  # a voxel of the cloud is a pixel or less where one sees a whole map
-_MAX_POINTS = 4_000_000  # of the cloud; a viewer with more of them is slow
+_MAX_POINTS = 3_000_000  # of the cloud; a viewer with more of them is slow
 _FLUSH_S = 60.0
 _MAX_PICTURES = 500  # of one mission
 _PICTURES_AT_ONCE = 20
