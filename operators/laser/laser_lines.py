@@ -32,7 +32,7 @@ class LaserLinesConfig(OperatorConfig):
 class Inputs:
     """Scans, and how the robot moved while they were taken; without it, it counts as standing."""
 
-    scans: Receiver[LaserScan2D]
+    laser: Receiver[LaserScan2D]
     odometry: Receiver[Odometry] | None = None
 
 
@@ -54,7 +54,7 @@ class LaserLines(Operator[Inputs, Outputs]):
 
     async def run(self, inputs: Inputs, outputs: Outputs) -> None:
         way = window(inputs.odometry, optional=True)
-        async for scan, odometry in anchored(inputs.scans, way):
+        async for scan, odometry in anchored(inputs.laser, way):
             if not self._is_due(scan):
                 outputs.planes.advance(scan.stamp_ns)
                 continue

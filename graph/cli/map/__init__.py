@@ -10,6 +10,7 @@ import typer
 from mapstream.graph.cli.map.certainty import align, covariance, reject_outliers
 from mapstream.graph.cli.map.edit import anchor, edit
 from mapstream.graph.cli.map.files import export_, import_
+from mapstream.graph.cli.map.grid import grid
 from mapstream.graph.cli.map.history import journal, redo, undo
 from mapstream.graph.cli.map.landmarks import add_verbs, optimize_visual
 from mapstream.graph.cli.map.look import check, cloud_quality, picture, stats, view
@@ -61,6 +62,7 @@ app.command("anchor")(anchor)
 app.add_typer(edit, name="edit")
 app.command("remove")(remove)
 app.command("merge")(merge)
+app.command("grid")(grid)
 app.command("summarize")(summarize)
 app.command("clsm", hidden=True)(summarize)
 add_verbs(app)

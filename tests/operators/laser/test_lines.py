@@ -88,7 +88,7 @@ async def test_E15_walls_are_planes_on_the_walls(
         stamps_ns=np.array([m.stamp_ns for m in odometry]),
         poses=np.array([m.T_odom_base.matrix for m in odometry]),
     )
-    out = await run_operator(LaserLines(LaserLinesConfig()), scans=scans, odometry=odometry)
+    out = await run_operator(LaserLines(LaserLinesConfig()), laser=scans, odometry=odometry)
     found: list[PlaneSegments] = out["planes"]
 
     assert len(found) == pytest.approx(len(scans) / 5, abs=1)
