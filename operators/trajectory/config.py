@@ -136,6 +136,8 @@ class TrajectoryConfig(OperatorConfig):
     """A submap goes out when it is so long ..."""
     num_poses: PositiveInt = 50
     """... or has so many poses."""
+    without: tuple[str, ...] = ()
+    """Inputs that are connected and not used, to see what each is worth: `--set trajectory.without=[planes]`."""
     mission: str = ""
     """Tells missions apart that begin at the same time; one robot needs none."""
 
@@ -145,6 +147,8 @@ class TrajectoryConfig(OperatorConfig):
         twice = sorted({name for name in names if names.count(name) > 1})
         if twice:
             raise ValueError(f"two inputs are called {twice[0]}; give each a name of its own")
+        if unknown := sorted(set(self.without) - set(names)):
+            raise ValueError(f"without: no input {unknown[0]}; there are {', '.join(names)}")
         if taken := {"imu", "sources", "cameras"} & set(self.mounts):
             raise ValueError(f"a mount is not called {taken.pop()}: the map keeps others there")
         return self

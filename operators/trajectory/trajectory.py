@@ -58,8 +58,10 @@ class Trajectory(DynamicPorts, Operator[Ports, Outputs]):
         window_s = config.window_s or 0.0
         memory_s = 2 * config.late_s + window_s + config.submap_s + 10.0
         keep_ns = END if config.window_s is None else round(memory_s * _SECOND_NS)
-        self._sources = {name: source_of(each, keep_ns) for name, each in config.sources.items()}
-        self._imu = None if config.imu is None else imu_source_of(config.imu, keep_ns)
+        used = [name for name in config.sources if name not in config.without]
+        self._sources = {name: source_of(config.sources[name], keep_ns) for name in used}
+        imu = None if "imu" in config.without else config.imu
+        self._imu = None if imu is None else imu_source_of(imu, keep_ns)
         self._trigger = trigger_of(config)
         self._triggers = {port: trigger_of(config) for port in _SEEN}
         self._T_odom_base = SE3.identity()  # the newest pose that the trigger was told
@@ -133,6 +135,8 @@ class Trajectory(DynamicPorts, Operator[Ports, Outputs]):
 
     def hear(self, port: str, message: Message) -> None:
         """Take one message in."""
+        if port in self._config.without:
+            return
         if isinstance(message, Constraint):
             if self._is_due(port, message.stamp_ns):
                 self.builder.add(message)
@@ -195,7 +199,8 @@ class Trajectory(DynamicPorts, Operator[Ports, Outputs]):
     def _pace(self) -> str | None:
         """The input whose messages decide where poses are made that nothing asks for."""
         inputs, _ = self.ports_for(self._config)
-        candidates = [name for name in inputs if name not in self._config.constraints]
+        left_out = {*self._config.constraints, *self._config.without}
+        candidates = [name for name in inputs if name not in left_out]
         return next((name for name in (*_SEEN, *candidates) if name in candidates), None)
 
     def _see(self, port: str, seen: PointCloud | NFrame) -> None:

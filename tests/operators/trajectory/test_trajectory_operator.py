@@ -163,3 +163,20 @@ async def test_B6_inside_isam2_a_splice_takes_the_old_edges_out() -> None:
 def test_two_inputs_of_one_name_are_refused() -> None:
     with pytest.raises(ValidationError, match="two inputs are called imu"):
         TrajectoryConfig.model_validate({"sources": {"imu": {"kind": "wheel"}}})
+
+
+@pytest.mark.parametrize(
+    ("without", "missing"), [("wheels", "wheel"), ("imu", "imu"), ("fixes", "position")]
+)
+async def test_N6_an_input_that_is_left_out_leaves_no_edge(without: str, missing: str) -> None:
+    """Each source can be switched off where it is wired, to see what it is worth."""
+    config = CONFIG.model_copy(update={"without": (without,)})
+
+    sent = await run_operator(Trajectory(config), config=config, **STREAMS)
+
+    kinds = set(mapped(sent["submaps"]).edges.kind.tolist())
+    assert kinds == {"wheel", "odometry", "imu", "position"} - {missing}
+    with pytest.raises(ValidationError, match="without: no input wheel; there are wheels"):
+        TrajectoryConfig.model_validate(
+            {"sources": {"wheels": {"kind": "wheel"}}, "without": ["wheel"]}
+        )
