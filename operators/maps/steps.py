@@ -39,6 +39,7 @@ TOOLS = {
     "compress_descriptors": "mapstream.operators.maps.descriptor_projections:compress_descriptors",
     "create_landmarks": "mapstream.operators.landmarks.create:create_landmarks",
     "evaluate_quality": "mapstream.operators.landmarks.quality:evaluate_quality",
+    "find_places": "mapstream.operators.lidar.places.find_places:find_places",
     "fix_stationary": "mapstream.operators.maps.stationary:fix_stationary",
     "keyframe": "mapstream.operators.maps.keyframing:keyframe",
     "optimize": "mapstream.operators.estimation.batch:optimize_map",

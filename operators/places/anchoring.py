@@ -12,6 +12,7 @@ import numpy as np
 from pydantic import Field, PositiveFloat, PositiveInt
 
 from mapstream.operators.maps.missions import find_mission
+from mapstream.operators.places.agreement import largest_agreement, mean_pose
 from mapstream.operators.places.database import PlaceDatabase
 from mapstream.operators.places.recognition import RecognitionConfig, recognize, seed_of
 from mapstream.operators.places.searching import landmark_positions
@@ -19,10 +20,8 @@ from mapstream.operators.places.views import VertexViews
 from mapstream.recordings.maps.build import anchored
 from mapstream.recordings.maps.model import Map
 from mapstream.recordings.maps.projections import projections_of
-from mapstream.streams.arrays import BoolArray, FloatArray
-from mapstream.streams.geometry import SE3, invert, se3_exp, se3_log, so3_log
-
-_MEANS = 10  # steps towards the mean of poses
+from mapstream.streams.arrays import FloatArray
+from mapstream.streams.geometry import SE3, invert
 
 
 class AnchoringConfig(RecognitionConfig):
@@ -107,7 +106,7 @@ def anchor_missions(
 def _anchor(map_: Map, mission_row: int, config: AnchoringConfig) -> tuple[Map, AnchoredMission]:
     rows = map_.vertices_of(mission_row)[:: config.every]
     places = _places_of_mission(map_, rows.tolist(), config)
-    best = _largest_agreement(places, config)
+    best = largest_agreement(places, config.max_turn_rad, config.max_shift_m)
     num = int(best.sum())
     verdict = _ANCHORED
     if num < config.min_frames:
@@ -115,7 +114,7 @@ def _anchor(map_: Map, mission_row: int, config: AnchoringConfig) -> tuple[Map, 
     elif num < config.min_share * len(places):
         verdict = f"{num} of {len(places)} frames agree, a smaller share than {config.min_share:g}"
     else:
-        map_ = anchored(map_, mission_row, SE3(_mean(places[best])))
+        map_ = anchored(map_, mission_row, SE3(mean_pose(places[best])))
     return map_, AnchoredMission(
         mission_id=map_.mission_id(mission_row),
         num_compared=len(rows),
@@ -146,24 +145,3 @@ def known_places(map_: Map, config: RecognitionConfig, views: VertexViews) -> Pl
     for vertex in np.flatnonzero(map_.missions.is_base_frame_known[map_.vertices.mission]).tolist():
         database.add(map_, vertex, views.at(vertex))
     return database
-
-
-def _largest_agreement(poses: FloatArray, config: AnchoringConfig) -> BoolArray:
-    """Return which poses (N,) agree with that one with which most do; every one is tried."""
-    best: BoolArray = np.zeros(len(poses), bool)
-    for pose in poses:
-        off = invert(pose) @ poses
-        turned = np.linalg.norm(so3_log(off[:, :3, :3]), axis=1)
-        shifted = np.linalg.norm(poses[:, :3, 3] - pose[:3, 3], axis=1)
-        agree = (turned <= config.max_turn_rad) & (shifted <= config.max_shift_m)
-        if agree.sum() > best.sum():
-            best = agree
-    return best
-
-
-def _mean(poses: FloatArray) -> FloatArray:
-    """Return the pose from which these (N, 4, 4) are off by nothing on the whole."""
-    mean: FloatArray = poses[0]
-    for _ in range(_MEANS):
-        mean = mean @ se3_exp(se3_log(invert(mean) @ poses).mean(axis=0))
-    return mean

@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from mapstream.graph.cli.map.certainty import align, covariance, reject_outliers
+from mapstream.graph.cli.map.dense import add_verbs as add_dense_verbs
 from mapstream.graph.cli.map.edit import anchor, edit
 from mapstream.graph.cli.map.files import export_, import_
 from mapstream.graph.cli.map.grid import grid
@@ -17,7 +18,7 @@ from mapstream.graph.cli.map.look import check, cloud_quality, picture, stats, v
 from mapstream.graph.cli.map.loops import close_loops, fix_stationary, loops
 from mapstream.graph.cli.map.parts import merge, remove
 from mapstream.graph.cli.map.places import summarize
-from mapstream.graph.cli.map.registration import register
+from mapstream.graph.cli.map.registration import find_places, register
 from mapstream.graph.cli.map.solve import optimize, relax
 from mapstream.graph.cli.map.surveys import elevation_, tiles
 
@@ -56,6 +57,7 @@ app.command("covariance")(covariance)
 app.command("close-loops")(close_loops)
 app.add_typer(loops, name="loops")
 app.command("register")(register)
+app.command("find-places")(find_places)
 app.command("admc", hidden=True)(register)
 app.command("fix-stationary")(fix_stationary)
 app.command("anchor")(anchor)
@@ -66,3 +68,4 @@ app.command("grid")(grid)
 app.command("summarize")(summarize)
 app.command("clsm", hidden=True)(summarize)
 add_verbs(app)
+add_dense_verbs(app)

@@ -1,4 +1,4 @@
-"""The verb that registers the clouds of keyframes to each other."""
+"""Verbs on the clouds of keyframes: registered to each other, and places that are recognised by them."""
 
 from __future__ import annotations
 
@@ -9,8 +9,10 @@ import typer
 
 from mapstream.graph.cli.options import KeySetList, config_from
 from mapstream.graph.cli.output import JsonFlag, fraction_bar, in_place, say, say_json
-from mapstream.operators.lidar.constraints.register import RegisterConfig
+from mapstream.operators.lidar.constraints.register import RegisterConfig, RegisterReport
 from mapstream.operators.lidar.constraints.register import register as register_tool
+from mapstream.operators.lidar.places.find_places import FindPlacesConfig, FindPlacesReport
+from mapstream.operators.lidar.places.find_places import find_places as find_places_tool
 from mapstream.recordings.maps.history import change_map
 
 
@@ -32,9 +34,30 @@ def register(
         report = change_map(
             folder, "register", lambda map_: register_tool(map_, config, folder, show), **settings
         )
+    _tell(folder, "register", report, json=json)
+
+
+def find_places(context: typer.Context, *, set_: KeySetList = None, json: JsonFlag = False) -> None:
+    """Find places that a LiDAR saw again, without a guess, and anchor missions that were lost by them."""
+    folder: Path = context.obj
+    config = config_from(FindPlacesConfig, set_)
+    settings = config.model_dump(mode="json", exclude_defaults=True)
+    with fraction_bar("finding places") as show:
+        report = change_map(
+            folder,
+            "find-places",
+            lambda map_: find_places_tool(map_, config, folder, show),
+            **settings,
+        )
+    _tell(folder, "find-places", report, json=json)
+
+
+def _tell(
+    folder: Path, verb: str, report: RegisterReport | FindPlacesReport, *, json: bool
+) -> None:
     if json:
         say_json(report)
         return
-    say(f"{in_place(folder)}: register")
+    say(f"{in_place(folder)}: {verb}")
     for line in report.lines():
         say(line)

@@ -158,7 +158,7 @@ def register(
         num_kept=len(own) - int(goes.sum()),
         num_removed=int(goes.sum()),
         added=_counted(pair.relation for pair in pairs if pair.verdict == ACCEPTED),
-        refused=_counted(_code(pair.verdict) for pair in pairs if pair.verdict != ACCEPTED),
+        refused=counted_verdicts(pair.verdict for pair in pairs),
         pairs=pairs,
     )
     return append_edges(map_, concatenate(edges)) if edges else map_, report
@@ -243,6 +243,6 @@ def _counted(words: Iterable[str]) -> dict[str, int]:
     return dict(sorted(Counter(words).items()))
 
 
-def _code(verdict: str) -> str:
-    """Return a verdict without its figures, so that verdicts can be counted."""
-    return re.sub(r"-?\b[\d.]+ ?", "", verdict).strip()
+def counted_verdicts(verdicts: Iterable[str]) -> dict[str, int]:
+    """Return how often there is each reason, with N for its figures."""
+    return _counted(re.sub(r"-?\b\d[\d.]*", "N", each) for each in verdicts if each != ACCEPTED)

@@ -1,0 +1,1 @@
+"""Places of a LiDAR, recognised without a guess of where they are."""

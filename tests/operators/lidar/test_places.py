@@ -1,0 +1,179 @@
+"""Places of a LiDAR: recognised from anywhere, never in another building, and missions that find each other."""
+
+import importlib.util
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from mapstream.operators.estimation.batch import optimize_map
+from mapstream.operators.lidar.places.birds_eye import levelling
+from mapstream.operators.lidar.places.find_places import SOURCE, FindPlacesConfig, find_places
+from mapstream.operators.lidar.places.place_matcher import PlaceMatcher, PlaceMatchingConfig
+from mapstream.operators.lidar.places.planar_motion import planar_motion
+from mapstream.operators.lidar.places.recognizers import make_recognizer
+from mapstream.recordings.maps.check import check_map
+from mapstream.streams.errors import ConfigError, EstimationError
+from mapstream.streams.geometry import SE3
+from tests.operators.lidar.drives import (
+    OTHER_MISSION,
+    both,
+    circle,
+    rms_m,
+    stored,
+    submap_of,
+    worst_edge_m,
+)
+from tests.operators.scenes import room, seen_from
+
+HALL = room(5, num_points=14_000, boxes=16)
+OTHER_HALL = room(6, num_points=14_000, boxes=16)
+CONFIG = FindPlacesConfig(neighbours=0, spacing_m=0.5, min_path_m=6.0)
+
+
+def somewhere(seed: int) -> SE3:
+    """Return a level pose in the hall, turned any way."""
+    x, y, yaw = np.random.default_rng(seed).uniform([-3, -2, -np.pi], [3, 2, np.pi])
+    return SE3.exp([0, 0, 0, x, y, 0]) @ SE3.exp([0, 0, yaw, 0, 0, 0])
+
+
+def test_I12_two_robots_merge_from_an_unknown_start(tmp_path: Path) -> None:
+    """The second drives the other way round from another place; every closure is true, and it is anchored by them."""
+    there, back = circle(12), [T @ SE3.exp([0, 0, np.pi, 0, 0, 0]) for T in circle(12)[::-1]][6:]
+    first = stored(submap_of(there, world=HALL), tmp_path)
+    second = stored(submap_of(back, world=HALL, mission=OTHER_MISSION, seed=90), tmp_path)
+
+    found, report = find_places(both(first, second), CONFIG, tmp_path)
+
+    assert report.num_between >= 4
+    assert worst_edge_m(found, SOURCE, [there, back]) < 0.03
+    assert found.missions.is_base_frame_known.all()
+    assert check_map(found) == []
+    solved, _ = optimize_map(found)
+    T_map_first, T_map_second = (
+        SE3(solved.T_map_base(solved.vertices_of(mission)[:1])[0]) for mission in (0, 1)
+    )
+    expected = T_map_first @ there[0].inverse() @ back[0]
+    assert np.linalg.norm((expected.inverse() @ T_map_second).t) < 0.05
+
+
+def test_I12_another_building_closes_no_loop(tmp_path: Path) -> None:
+    first = stored(submap_of(circle(8)[:5], world=HALL), tmp_path)
+    second = stored(submap_of(circle(8)[:5], world=OTHER_HALL, mission=OTHER_MISSION), tmp_path)
+
+    found, report = find_places(both(first, second), CONFIG, tmp_path)
+
+    assert report.num_between == 0
+    assert not found.missions.is_base_frame_known[1]
+    assert "no loop leads" in report.anchored[OTHER_MISSION]
+
+
+def test_I12_a_mission_closes_its_own_loops_without_a_guess(tmp_path: Path) -> None:
+    """Looks do not care how far odometry is off when the robot is back."""
+    truth = circle(10)
+    drift = SE3.exp([0, 0, 0.01, 0.03, 0.03, 0.02])
+    map_ = stored(submap_of(truth, drift, world=HALL), tmp_path)
+
+    found, report = find_places(map_, CONFIG, tmp_path)
+    solved, _ = optimize_map(found)
+
+    assert report.num_within >= 1
+    assert worst_edge_m(found, SOURCE, [truth]) < 0.03
+    assert rms_m(solved, truth) < rms_m(map_, truth) / 3
+
+
+def test_I12_loops_with_which_too_few_agree_do_not_count(tmp_path: Path) -> None:
+    first = stored(submap_of(circle(8)[:3], world=HALL), tmp_path)
+    second = stored(submap_of(circle(8)[:2], world=HALL, mission=OTHER_MISSION), tmp_path)
+
+    found, report = find_places(both(first, second), CONFIG, tmp_path)
+
+    assert report.num_between == 0
+    assert report.num_alone == 2
+    assert not found.missions.is_base_frame_known[1]
+    again, _ = find_places(both(first, second), CONFIG, tmp_path)
+    assert again.digest() == found.digest()
+
+
+def test_places_are_told_apart_by_registration_when_looks_are_forced(tmp_path: Path) -> None:
+    """With a bar so low that anything is proposed, registration refuses another building."""
+    options = {"min_inliers": 3, "max_differing_bits": 120}
+    config = PlaceMatchingConfig(recognizer_options=options)
+    clouds = [seen_from(HALL, somewhere(k), k) for k in range(3)]
+    matcher = PlaceMatcher(config, lambda key: clouds[key])
+    for key in range(3):
+        matcher.add(key)
+
+    judged = matcher.recognize(seen_from(OTHER_HALL, somewhere(9), 9))
+
+    assert judged
+    assert all("inlier fraction" in each.verdict or "rmse" in each.verdict for each in judged)
+
+
+@given(st.integers(0, 10_000))
+@settings(max_examples=30, deadline=None)
+def test_a_planar_motion_is_found_among_false_pairs(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    yaw, x, y = rng.uniform([-np.pi, -20, -20], [np.pi, 20, 20])
+    source = rng.uniform(-20, 20, (60, 2))
+    turn = np.array([[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]])
+    target = source @ turn.T + [x, y] + rng.normal(0, 0.05, (60, 2))
+    target[40:] = rng.uniform(-20, 20, (20, 2))
+
+    motion = planar_motion(source, target, tolerance_m=0.6, num_samples=500, seed=1)
+
+    assert motion.is_inlier[:40].sum() >= 38
+    assert np.allclose(motion.T_target_source.t, [x, y, 0], atol=0.1)
+    assert np.allclose(motion.T_target_source.R[:2, :2], turn, atol=0.01)
+
+
+def test_no_motion_explains_what_has_nothing_in_common() -> None:
+    two = np.array([[0.0, 0.0], [5.0, 0.0]])
+
+    assert planar_motion(two, two, tolerance_m=0.6, num_samples=10, seed=0).num_inliers == 0
+
+
+@given(st.floats(-0.3, 0.3), st.floats(-0.3, 0.3), st.floats(-3, 3))
+@settings(max_examples=20, deadline=None)
+def test_a_tilted_base_is_levelled_over_the_ground(roll: float, pitch: float, yaw: float) -> None:
+    T_world_base = SE3.exp([0, 0, yaw, 0.5, 0.3, 0.1]) @ SE3.exp([roll, pitch, 0, 0, 0, 0])
+    points = seen_from(HALL, T_world_base, 3)
+
+    T_level_world = levelling(points, 30.0) @ T_world_base.inverse()
+
+    assert np.degrees(np.arccos(min(T_level_world.R[2, 2], 1.0))) < 1.0
+    assert abs((T_level_world @ np.array([[0.5, 0.3, -2.0]]))[0, 2]) < 0.1
+
+
+def test_a_cloud_without_ground_is_refused() -> None:
+    with pytest.raises(EstimationError, match="too few to find the ground"):
+        levelling(np.zeros((5, 3)), 30.0)
+    ramp = np.random.default_rng(0).uniform(-10, 10, (2000, 3))
+    ramp[:, 2] = ramp[:, 0]
+    with pytest.raises(EstimationError, match="tilted by 45 deg"):
+        levelling(ramp, 30.0)
+
+
+def test_a_recogniser_that_is_not_there_says_what_is() -> None:
+    with pytest.raises(
+        ConfigError, match="unknown recogniser of places 'nose'; known: birds_eye, map_closures"
+    ):
+        make_recognizer("nose", {})
+    if importlib.util.find_spec("map_closures") is None:
+        with pytest.raises(ConfigError, match=r"pip install 'mapstream\[closures\]'"):
+            make_recognizer("map_closures", {})
+
+
+def test_I12_map_closures_recognises_the_hall() -> None:
+    pytest.importorskip("map_closures", reason="the extra `closures` is not installed")
+    recognizer = make_recognizer("map_closures", {"density_map_resolution": 0.1})
+    for key in range(6):
+        recognizer.add(100 + key, seen_from(HALL, somewhere(key), key))
+    T_query = somewhere(50)
+
+    best = recognizer.propose(seen_from(HALL, T_query, 50))[0]
+
+    expected = somewhere(best.key - 100).inverse() @ T_query
+    assert np.linalg.norm((expected.inverse() @ best.T_place_query).t) < 0.5
