@@ -57,7 +57,7 @@ def deskew_along(
     inside = trajectory.stamps_ns[
         (trajectory.stamps_ns > start_ns) & (trajectory.stamps_ns < end_ns)
     ]
-    even = np.linspace(start_ns, end_ns, _NUM_KNOTS).astype(np.int64)
+    even = start_ns + np.linspace(0, end_ns - start_ns, _NUM_KNOTS).astype(np.int64)
     knots_ns = np.union1d(np.union1d(even, inside), [start_ns, end_ns])
     reference = trajectory.pose_at(end_ns if reference_ns is None else reference_ns)
     T_reference_knots = invert(reference.matrix) @ trajectory.at(knots_ns)

@@ -1,51 +1,94 @@
-"""What a registration could and could not observe: covariance from its Hessian.
+"""What a registration could and could not observe: its information, and the directions that it leaves open.
 
 At the solution each matched point tells the pose one number, its distance across the surface.
-The Hessian of their squares is the information; a corridor's axis gets next to none.
-Source: Censi, An accurate closed-form estimate of ICP's covariance, ICRA 2007 (its first term);
-Zhang, Kaess, Singh, On degeneracy of optimization-based state estimation problems, ICRA 2016.
+The Hessian of their squares is the information; a corridor's axis gets next to none, and what it gets is
+the noise of estimated normals. Such a direction is left out, and its variance says so (`UNOBSERVED_VARIANCE`).
+Source: Zhang, Kaess, Singh, On degeneracy of optimization-based state estimation problems, ICRA 2016;
+Tuna et al., X-ICP, T-RO 2024; Censi, An accurate closed-form estimate of ICP's covariance, ICRA 2007 (its
+first term).
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from mapstream.streams.arrays import FloatArray
-from mapstream.streams.geometry import hat
+from mapstream.streams.geometry import hat, symmetric
+from mapstream.streams.messages.estimates import UNOBSERVED_VARIANCE
 
 _NOISE_FLOOR_M = 0.01  # of a range; simulated surfaces fit better than any real one
 _CORRELATION = 25.0  # neighbouring points share their errors: this many count as one
 _NORMAL_ERROR_RAD = (
     0.05  # of an estimated normal: what it seems to see along its own surface is noise
 )
-_MAX_SIGMA_M = 10.0  # of a direction that nothing observes
 
 
-def covariance_of_planes(points: FloatArray, normals: FloatArray, rmse_m: float) -> FloatArray:
-    """Return the covariance (6, 6) of a pose from points matched to planes.
+@dataclass(frozen=True, slots=True, eq=False)
+class Observability:
+    """What points on planes say of a pose; tangent vectors have the rotation first [rad, m]."""
+
+    information: FloatArray  # (6, 6), zero along the directions that are open
+    covariance: FloatArray  # (6, 6), `UNOBSERVED_VARIANCE` along them
+    variance: float  # [m^2] that one row of unit weight was taken to have
+    unseen: FloatArray  # (K, 6) directions that are open, unit vectors
+    seen_part: FloatArray  # (6, 6) takes a tangent vector to its part that is not open
+
+    def __post_init__(self) -> None:
+        for name in ("information", "covariance", "unseen", "seen_part"):
+            getattr(self, name).flags.writeable = False
+
+
+def observability_of_planes(
+    points: FloatArray, normals: FloatArray, rmse_m: float, weights: FloatArray | None = None
+) -> Observability:
+    """Return what the distances of points from planes observe of the pose.
 
     Args:
         points: (N, 3) in the moving frame [m].
         normals: (N, 3) of the planes they lie on, turned into the moving frame.
         rmse_m: Of the distances across the planes.
+        weights: (N,) how much each point counts; left out, all count alike.
 
-    Rotation first, perturbation on the right: each row of the Jacobian is [p x n, n].
+    Perturbation on the right: each row of the Jacobian is [p x n, n].
     """
+    root = np.ones(len(points)) if weights is None else np.sqrt(weights)
     reach_m = float(np.sqrt(np.mean(np.sum(points**2, axis=1)))) if len(points) else 1.0
     reach_m = max(reach_m, 1e-3)
     scale = np.array([1 / reach_m] * 3 + [1.0] * 3)  # rotations as metres at the mean range
-    jacobian = np.hstack([np.cross(points, normals), normals]) * scale
+    jacobian = np.hstack([np.cross(points, normals), normals]) * scale * root[:, None]
     variance = _CORRELATION * max(rmse_m if np.isfinite(rmse_m) else 0.0, _NOISE_FLOOR_M) ** 2
-    seen = jacobian.T @ jacobian - _seen_by_noise(points) * np.outer(scale, scale)
-    information, axes = np.linalg.eigh(seen / variance)
-    variances = 1 / np.maximum(information, 1 / _MAX_SIGMA_M**2)
-    covariance: FloatArray = (axes * variances) @ axes.T * np.outer(scale, scale)
-    return (covariance + covariance.T) / 2
+    squares = jacobian.T @ jacobian
+    noise = _seen_by_noise(points * root[:, None], root) * np.outer(scale, scale)
+    surplus, axes = np.linalg.eigh(squares - noise)
+    is_open = surplus <= np.einsum("ik,ij,jk->k", axes, noise, axes)
+    unseen = axes.T[is_open] * scale
+    unseen /= np.linalg.norm(unseen, axis=1, keepdims=True)
+    variances = variance / np.where(is_open, np.inf, surplus)
+    seen_part = (axes * ~is_open) @ axes.T
+    units = np.outer(scale, scale)
+    covariance = (axes * variances) @ axes.T * units + UNOBSERVED_VARIANCE * unseen.T @ unseen
+    return Observability(
+        information=symmetric(seen_part @ squares @ seen_part / variance / units),
+        covariance=symmetric(covariance),
+        variance=variance,
+        unseen=unseen,
+        seen_part=scale[:, None] * seen_part / scale,
+    )
 
 
-def _seen_by_noise(points: FloatArray) -> FloatArray:
-    """Return what normals of no use at all, but with the usual error, would add to the squares (6, 6)."""
-    lever = hat(points.sum(axis=0))
+def covariance_of_planes(points: FloatArray, normals: FloatArray, rmse_m: float) -> FloatArray:
+    """Return the covariance (6, 6) alone, of `observability_of_planes`."""
+    return observability_of_planes(points, normals, rmse_m).covariance
+
+
+def _seen_by_noise(points: FloatArray, root: FloatArray) -> FloatArray:
+    """Return what normals of no use at all, but with the usual error, would add to the squares (6, 6).
+
+    Both arguments carry the root of the points' weights: (N, 3) and (N,).
+    """
+    lever = hat(root @ points)
     rotation = np.sum(points**2) * np.eye(3) - points.T @ points
-    noise: FloatArray = np.block([[rotation, lever], [lever.T, len(points) * np.eye(3)]])
+    noise: FloatArray = np.block([[rotation, lever], [lever.T, root @ root * np.eye(3)]])
     return _NORMAL_ERROR_RAD**2 * noise

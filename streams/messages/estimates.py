@@ -1,6 +1,8 @@
 """What operators conclude: odometry, keyframes, submaps, loop closures, corrections.
 
 Covariances are (6, 6) of the tangent vector, rotation first [rad, m], perturbation on the right.
+What was not measured has an infinite variance where it is an axis, and `UNOBSERVED_VARIANCE` along any
+direction; both leave it out of what is estimated.
 A mission is named by 32 hex digits; with a stamp they name one vertex.
 """
 
@@ -17,6 +19,8 @@ from mapstream.streams.geometry import SE3
 from mapstream.streams.messages.constraints import Constraint
 from mapstream.streams.messages.sensors import ImuBatch, RecordRef
 from mapstream.streams.messages.vision import ImageFeatures
+
+UNOBSERVED_VARIANCE = 1e6  # [rad^2, m^2]; much more would cost the digits of the other directions
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

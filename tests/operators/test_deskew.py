@@ -57,6 +57,15 @@ def test_a_known_trajectory_undoes_any_motion() -> None:
     np.testing.assert_allclose(found, at_end, atol=2e-3)
 
 
+@pytest.mark.parametrize("duration_ns", [99_444_444, 99_444_445, 99_999_999])
+def test_a_trajectory_that_ends_with_the_sweep_covers_it(duration_ns: int) -> None:
+    stamps_ns = 1_700_000_000 * 10**9 + np.array([0, duration_ns])
+    standing = Trajectory(stamps_ns=stamps_ns, poses=np.repeat(np.eye(4)[None], 2, axis=0))
+    seen = np.ones((2, 3))
+
+    np.testing.assert_array_equal(deskew_along(seen, stamps_ns, standing), seen)
+
+
 def test_a_sweep_outside_the_trajectory_is_refused() -> None:
     short = Trajectory(stamps_ns=np.array([0, 10]), poses=np.repeat(np.eye(4)[None], 2, axis=0))
 

@@ -58,6 +58,17 @@ class ImuSamples:
         self._stamps_ns, self._values = self._stamps_ns[first:], self._values[first:]
         self._is_saturated = self._is_saturated[first:]
 
+    def batch(self, start_ns: int, end_ns: int) -> ImuBatch:
+        """Return the samples that enclose two stamps, as far as there are such."""
+        first = max(0, int(np.searchsorted(self._stamps_ns, start_ns, side="right")) - 1)
+        last = int(np.searchsorted(self._stamps_ns, end_ns, side="left")) + 1
+        values = self._values[first:last]
+        return ImuBatch(
+            stamps_ns=self._stamps_ns[first:last],
+            gyro_radps=values[:, :3],
+            accel_mps2=values[:, 3:],
+        )
+
     def between(self, start_ns: int, end_ns: int) -> Motion:
         """Return what was measured between two stamps; beyond the samples the nearest one stands.
 
