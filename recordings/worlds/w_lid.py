@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from heapq import merge
 
 import numpy as np
@@ -19,9 +20,10 @@ from mapstream.recordings.worlds.sensors import (
     imu_batches,
 )
 from mapstream.recordings.worlds.simulation import Record, Simulation
-from mapstream.streams.arrays import FloatArray
-from mapstream.streams.geometry import SE3, so3_exp
+from mapstream.streams.arrays import FloatArray, IntArray
+from mapstream.streams.geometry import SE3, invert, se3_exp, so3_exp
 from mapstream.streams.messages.estimates import Odometry
+from mapstream.streams.messages.sensors import WheelOdometry
 
 START_NS = 1_700_000_000 * 10**9
 # Turned, so that a forgotten extrinsic shows; level, or point-to-point ICP would climb along the rings.
@@ -54,6 +56,8 @@ class WLidConfig(BaseModel):
     """Speed on the straight; corners are slower."""
     odometry_drift: NonNegativeFloat = 0.005
     """Drift of the topic `/odometry`, as a part of the distance."""
+    wheel_drift: NonNegativeFloat | None = None
+    """With wheels, which roll every way without slipping: the drift of the topic `/wheels`; null: there are none."""
     aggressive: bool = False
     """Spins at 90 deg/s, to one side and the other."""
     blank_walls: bool = False
@@ -65,13 +69,13 @@ class WLidConfig(BaseModel):
 def w_lid(config: WLidConfig, seed: int) -> Simulation:
     """Return the recording of one drive; equal arguments give equal recordings.
 
-    Topics: `/points`, `/imu`, `/odometry` (drifts) and `/truth`, the pose of the base in the world,
-    which is where the base starts unless `start_fraction` or `reverse` says otherwise.
+    Topics: `/points`, `/imu`, `/odometry` (drifts), `/wheels` if there are, and `/truth`, the pose of the base
+    in the world, which is where the base starts unless `start_fraction` or `reverse` says otherwise.
     """
-    seeds = np.random.SeedSequence(seed).spawn(4)
+    seeds = np.random.SeedSequence(seed).spawn(5)
     if config.building is not None:
         seeds[0] = np.random.SeedSequence(config.building).spawn(1)[0]
-    world_rng, lidar_rng, imu_rng, odometry_rng = map(np.random.default_rng, seeds)
+    world_rng, lidar_rng, imu_rng, odometry_rng, wheel_rng = map(np.random.default_rng, seeds)
     ring = Ring(config.length_m)
     motion = drive(ring, config)
     caster = RayCaster(Corridor(ring, world_rng, is_blank=config.blank_walls).mesh())
@@ -83,6 +87,7 @@ def w_lid(config: WLidConfig, seed: int) -> Simulation:
     odometry = drifting_odometry(
         poses[coarse], stamps_ns[coarse], config.odometry_drift, odometry_rng
     )
+    wheels = _wheels(poses[coarse], stamps_ns[coarse], config.wheel_drift, wheel_rng)
     imu = imu_batches(config.imu, T_BASE_IMU, motion, imu_rng)
     starts = range(motion.start_ns, motion.end_ns - lidar.period_ns + 1, lidar.period_ns)
     scans = (lidar.scan(caster, motion, start) for start in starts)
@@ -92,6 +97,7 @@ def w_lid(config: WLidConfig, seed: int) -> Simulation:
         records=merge(
             (Record(m.stamp_ns, "/imu", m) for m in imu),
             (Record(m.stamp_ns, "/odometry", m) for m in odometry),
+            (Record(m.stamp_ns, "/wheels", m) for m in wheels),
             (Record(m.stamp_ns, "/truth", m) for m in truth),
             (Record(m.stamp_ns + lidar.period_ns, "/points", m) for m in scans),
             key=lambda record: record.log_ns,
@@ -101,6 +107,19 @@ def w_lid(config: WLidConfig, seed: int) -> Simulation:
 
 def _odometry(stamp_ns: int, T_world_base: FloatArray) -> Odometry:
     return Odometry(stamp_ns=stamp_ns, T_odom_base=SE3(T_world_base))
+
+
+def _wheels(
+    poses: FloatArray, stamps_ns: IntArray, drift: float | None, rng: np.random.Generator
+) -> Iterator[WheelOdometry]:
+    """Yield what wheels say of a path (N, 4, 4): that of its shadow on the floor, and nothing without wheels."""
+    if drift is None:
+        return
+    yaw = np.arctan2(poses[:, 1, 0], poses[:, 0, 0])
+    shadow = se3_exp(yaw[:, None] * [0.0, 0.0, 1.0, 0.0, 0.0, 0.0])
+    shadow[:, :2, 3] = poses[:, :2, 3]
+    for each in drifting_odometry(invert(shadow[0]) @ shadow, stamps_ns, drift, rng):
+        yield WheelOdometry(stamp_ns=each.stamp_ns, T_odom_base=each.T_odom_base)
 
 
 def drive(ring: Ring, config: WLidConfig) -> Motion:
