@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from bisect import bisect_left
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar
@@ -11,13 +9,13 @@ from typing import ClassVar
 from pydantic import Field, NonNegativeFloat
 
 from mapstream.operators.operator import Operator, OperatorConfig, Placement, offload, warn
-from mapstream.operators.places.drift import Drift, DriftConfig, Fix
+from mapstream.operators.places.drift import DriftConfig
+from mapstream.operators.places.following import Following
 from mapstream.operators.places.map_places import MapPlaces
 from mapstream.operators.places.recognition import Recognition, RecognitionConfig
 from mapstream.operators.places.views import view_of
 from mapstream.recordings.maps import load_map
 from mapstream.streams.channel import Receiver, Sender
-from mapstream.streams.geometry import SE3
 from mapstream.streams.messages.estimates import MapPose, Odometry
 from mapstream.streams.messages.vision import NFrame
 from mapstream.streams.sync import merge
@@ -63,13 +61,11 @@ class Localize(Operator[Inputs, Outputs]):
 
     def __init__(self, config: LocalizeConfig) -> None:
         self._config = config
-        self._drift = Drift(config.drift)
         self._places: MapPlaces | None = None
         self._late_ns = round(config.late_s * 1e9)
-        self._moves: list[Odometry] = []  # as far back as frames may be late
+        self._following = Following(config.drift, self._late_ns)
         self._compared_ns: int | None = None
         self._waiting: list[NFrame] = []  # for the odometry of their time
-        self._has_tracked = self._was_tracking = False
 
     async def run(self, inputs: Inputs, outputs: Outputs) -> None:
         self._places = await offload(self._opened)
@@ -85,7 +81,7 @@ class Localize(Operator[Inputs, Outputs]):
                 await self._send(outputs, await offload(self.follow, message))
             elif self._is_due(message):
                 self._waiting.append(message)
-        if not self._has_tracked:
+        if not self._following.has_tracked:
             warn("the robot was never found in the map")
 
     def _opened(self) -> MapPlaces:
@@ -124,8 +120,7 @@ class Localize(Operator[Inputs, Outputs]):
 
     def follow(self, odometry: Odometry) -> MapPose:
         """Return where the robot is at this moment of its odometry, after the frames until then."""
-        self._moves.append(odometry)
-        self._drift.move(odometry.T_odom_base)
+        self._following.move(odometry)
         num_inliers, verdict = 0, ""
         for frame in self._waiting:
             recognition = self._recognition(frame)
@@ -133,40 +128,12 @@ class Localize(Operator[Inputs, Outputs]):
             if recognition.found is not None:
                 num_inliers = len(recognition.found.inliers)
                 pose = recognition.found.consensus.pose
-                T_odom_base = _at(self._moves, frame.stamp_ns)
-                fix = Fix(frame.stamp_ns, pose.T_map_base, pose.covariance, T_odom_base)
-                self._drift.correct(fix)
+                self._following.correct(frame.stamp_ns, pose.T_map_base, pose.covariance)
         self._waiting.clear()
-        while len(self._moves) > 1 and self._moves[1].stamp_ns <= odometry.stamp_ns - self._late_ns:
-            del self._moves[0]
-        T_map_odom = self._drift.T_map_odom(odometry.stamp_ns)
-        is_back = T_map_odom is not None and self._has_tracked and not self._was_tracking
-        self._was_tracking = T_map_odom is not None
-        self._has_tracked |= self._was_tracking
-        if T_map_odom is None:
-            return MapPose(
-                stamp_ns=odometry.stamp_ns, state="lost", num_inliers=num_inliers, verdict=verdict
-            )
-        return MapPose(
-            stamp_ns=odometry.stamp_ns,
-            state="recovered" if is_back else "tracking",
-            T_map_base=T_map_odom @ odometry.T_odom_base,
-            T_map_odom=T_map_odom,
-            covariance=self._drift.covariance,
-            num_inliers=num_inliers,
-            verdict=verdict,
-        )
+        return self._following.pose(num_inliers, verdict)
 
     def _recognition(self, frame: NFrame) -> Recognition:
         places = self._places or self._opened()
         self._places = places
         views = [view_of(features) for features in frame.features if features.descriptors.size]
         return places.recognize(views, seed=frame.stamp_ns % 2**32)
-
-
-def _at(moves: Sequence[Odometry], stamp_ns: int) -> SE3:
-    """Return the odometry's pose at a moment; beyond its ends, that of the nearest message."""
-    after = bisect_left(moves[:-1], stamp_ns, key=lambda move: move.stamp_ns)
-    a, b = moves[max(after - 1, 0)], moves[after]
-    fraction = (stamp_ns - a.stamp_ns) / max(b.stamp_ns - a.stamp_ns, 1)
-    return a.T_odom_base.interpolate(b.T_odom_base, min(max(fraction, 0.0), 1.0))

@@ -22,7 +22,8 @@ from mapstream.streams.errors import EstimationError
 from mapstream.streams.geometry import SE3, so3_exp
 
 _GROUND_CELL_M = 1.0
-_GROUND_WIDTHS_M = np.geomspace(3.0, 0.15, 10)  # points farther off hardly count: wide first, for tilts
+# Points farther off the ground hardly count: a wide look first, which sees tilts, then closer ones.
+_GROUND_WIDTHS_M = np.geomspace(3.0, 0.15, 10)
 _MIN_CELLS = 10
 _FULL_SHARE = 0.95  # of the columns with something in them, those below full white
 
