@@ -10,15 +10,12 @@ from pydantic import Field, PositiveFloat
 
 from mapstream.operators.features.gray import gray
 from mapstream.operators.images.calibrated import require_camera
-from mapstream.operators.images.depth import depth_m_of
-from mapstream.operators.images.pinhole_maps import calibration_key
+from mapstream.operators.images.depth import PixelRays, depth_m_of
 from mapstream.operators.odometry.rgbd.shape import Shape, shape_of
 from mapstream.operators.odometry.rgbd.shape_fit import ShapeFit, fit_shape
 from mapstream.operators.odometry.uncertainty import chain, unmeasured
 from mapstream.operators.operator import Operator, OperatorConfig, Placement, offload, warn
-from mapstream.streams.arrays import Float32Array, FloatArray
-from mapstream.streams.calibration import CameraCalibration
-from mapstream.streams.camera_models import unproject
+from mapstream.streams.arrays import FloatArray
 from mapstream.streams.channel import Receiver, Sender
 from mapstream.streams.errors import EstimationError, OperatorError
 from mapstream.streams.geometry import SE3, invert, so3_log, straightened
@@ -81,7 +78,7 @@ class RgbdOdometry(Operator[Inputs, Outputs]):
             (6, 6)
         )  # of the last pose of the base, perturbed on the right
         self._last_ns: int | None = None
-        self._rays: tuple[object, Float32Array] | None = None
+        self._rays = PixelRays()
 
     async def run(self, inputs: Inputs, outputs: Outputs) -> None:
         apart_ns = round(self._config.max_apart_s * 1e9)
@@ -137,10 +134,8 @@ class RgbdOdometry(Operator[Inputs, Outputs]):
                 f"depth of {depth.frame} is {depth.image.shape}, images of {frame.frame} are "
                 f"{frame.image.shape[:2]}; put depth_registration before rgbd_odometry"
             )
-        if self._rays is None or self._rays[0] != calibration_key(camera):
-            self._rays = calibration_key(camera), _rays_of(camera)
         depth_m = depth_m_of(depth, least_m=config.min_depth_m, most_m=config.max_depth_m)
-        return shape_of(gray(frame), depth_m, self._rays[1])
+        return shape_of(gray(frame), depth_m, self._rays.of(camera))
 
     def _fit(self, shape: Shape) -> ShapeFit:
         """Return the pose of an image against the keyframes from the nearest places.
@@ -181,11 +176,3 @@ def _apart(a: FloatArray, b: FloatArray) -> float:
     """Return how far two views are from each other [m]."""
     T = invert(a) @ b
     return float(np.linalg.norm(T[:3, 3]) + _RADIAN_M * np.linalg.norm(so3_log(T[:3, :3])))
-
-
-def _rays_of(camera: CameraCalibration) -> Float32Array:
-    """Return the points of depth 1 m (H, W, 3) of all pixels."""
-    x, y = np.meshgrid(np.arange(camera.width_px), np.arange(camera.height_px))
-    rays = unproject(camera, np.stack([x.ravel(), y.ravel()], axis=1).astype(np.float64))
-    rays /= rays[:, 2:]
-    return rays.astype(np.float32).reshape(camera.height_px, camera.width_px, 3)

@@ -1,0 +1,1 @@
+"""What depth images alone tell."""
