@@ -11,6 +11,7 @@ from mapstream.operators.maps.aggregate import AggregateConfig, aggregate_cloud
 from mapstream.recordings.maps import Map
 from mapstream.recordings.maps.cameras import cameras_of
 from mapstream.recordings.maps.records import record_rows, recorded
+from mapstream.recordings.mesh_files import SurfaceMesh
 from mapstream.streams.errors import DecodeError, MapError, RecordingError
 from mapstream.streams.messages.sensors import CameraFrame, EncodedImage
 
@@ -26,7 +27,12 @@ _PICTURES_AT_ONCE = 20
 
 
 def view_map(
-    map_: Map, folder: Path | None, sink: Sink, *, voxel_size_m: float = _VOXEL_SIZE_M
+    map_: Map,
+    folder: Path | None,
+    sink: Sink,
+    *,
+    voxel_size_m: float = _VOXEL_SIZE_M,
+    mesh: SurfaceMesh | None = None,
 ) -> list[str]:
     """Draw a map, and return what is missing from the picture.
 
@@ -35,6 +41,7 @@ def view_map(
         folder: Its folder, with the clouds of its keyframes; None: without clouds.
         sink: Where it is drawn.
         voxel_size_m: One point of the cloud is drawn per voxel; voxels of a large map are larger.
+        mesh: Its surface, in the map frame.
 
     Raises:
         MapError: If no viewer answers, or the one that did takes nothing.
@@ -42,6 +49,7 @@ def view_map(
     from mapstream.graph.blueprint_map import map_blueprint  # noqa: PLC0415  # imports rerun
     from mapstream.graph.views import Scene, view_of  # noqa: PLC0415
     from mapstream.graph.views.maps import cloud_entry  # noqa: PLC0415
+    from mapstream.graph.views.meshes import mesh_entry  # noqa: PLC0415
 
     notes = []
     scene = Scene(path=_PATH)
@@ -54,6 +62,8 @@ def view_map(
             drawing.append(cloud_entry(map_, aggregate_cloud(map_, folder, config), scene))
         except MapError as error:  # a map without clouds still has trajectories
             notes.append(f"rerun: the map is drawn without clouds: {error}")
+    if mesh is not None:
+        drawing.append(mesh_entry(mesh))
     end_s = time.monotonic() + sink.patience_s
     while not sink.try_open(map_blueprint(map_)):
         if time.monotonic() > end_s:

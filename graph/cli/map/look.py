@@ -22,6 +22,7 @@ from mapstream.graph.cli.output import (
 from mapstream.operators.maps.cloud_quality import CloudQualityConfig, map_cloud_quality
 from mapstream.operators.maps.statistics import map_statistics
 from mapstream.recordings.maps import check_map, load_map
+from mapstream.recordings.mesh_files import read_mesh
 from mapstream.streams.arrays import FloatArray
 
 
@@ -115,13 +116,17 @@ def view(
     context: typer.Context,
     *,
     rerun: Annotated[str, typer.Option(help="spawn, connect[=URL] or save=FILE.")] = "spawn",
+    mesh: Annotated[
+        Path | None, typer.Option(help="Also a surface, as `mesh` wrote it: .ply or .glb.")
+    ] = None,
 ) -> None:
     """Show the map in Rerun: trajectories, loops by their switches, the cloud of all keyframes."""
     from mapstream.graph.tap_map import view_map  # noqa: PLC0415  # rerun takes its time
     from mapstream.graph.tap_sinks import SinkSpec  # noqa: PLC0415
 
     folder: Path = context.obj
-    for note in view_map(load_map(folder), folder, SinkSpec.parse(rerun).open()):
+    surface = read_mesh(mesh) if mesh is not None else None
+    for note in view_map(load_map(folder), folder, SinkSpec.parse(rerun).open(), mesh=surface):
         complain(note)
 
 
