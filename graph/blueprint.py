@@ -19,6 +19,7 @@ from mapstream.streams.messages import estimates, sensors, vision
 
 _IN_SPACE = (
     sensors.LidarScan,
+    sensors.OrganizedCloud,
     sensors.LaserScan2D,
     sensors.WheelOdometry,
     estimates.PointCloud,

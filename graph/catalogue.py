@@ -26,6 +26,7 @@ BUILT_IN = {
     "absolute_poses": "mapstream.operators.absolute.poses:AbsolutePoses",
     "clahe": "mapstream.operators.images.clahe:Clahe",
     "cloud_colors": "mapstream.operators.images.cloud_colors:CloudColors",
+    "cloud_images": "mapstream.operators.depth.cloud_images:CloudImages",
     "cloud_odometry": "mapstream.operators.odometry.cloud_odometry:CloudOdometry",
     "cloud_sink": "mapstream.operators.sinks.cloud:CloudSink",
     "cloud_planes": "mapstream.operators.planes.cloud_planes:CloudPlanes",

@@ -31,6 +31,7 @@ class Worth(IntEnum):
 
 _WORTH = {
     sensors.LidarScan: Worth.SAMPLE,
+    sensors.OrganizedCloud: Worth.SAMPLE,
     sensors.LaserScan2D: Worth.SAMPLE,
     sensors.CameraFrame: Worth.SAMPLE,
     sensors.EncodedImage: Worth.SAMPLE,

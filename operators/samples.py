@@ -25,6 +25,7 @@ from mapstream.streams.messages.sensors import (
     ImuBatch,
     LaserScan2D,
     LidarScan,
+    OrganizedCloud,
     TransformBatch,
     WheelOdometry,
 )
@@ -67,6 +68,12 @@ def _points(i: int) -> np.ndarray[Any, np.dtype[np.float32]]:
 def _scan(stamp_ns: int, i: int) -> LidarScan:
     offsets_ns = np.linspace(0, PERIOD_NS * 0.9, 600).astype(np.int64)
     return LidarScan(stamp_ns=stamp_ns, points=_points(i), offsets_ns=offsets_ns)
+
+
+def _organized(stamp_ns: int, i: int) -> OrganizedCloud:
+    x, y = np.meshgrid(np.linspace(-0.5, 0.5, 40), np.linspace(-0.4, 0.4, 30))
+    points = np.stack([x, y, np.ones_like(x)], axis=2) * (2 + 0.01 * i)
+    return OrganizedCloud(stamp_ns=stamp_ns, points=points.astype(np.float32))
 
 
 def _cloud(stamp_ns: int, i: int) -> PointCloud:
@@ -195,6 +202,7 @@ _MAKERS: dict[object, Callable[[int, int], Any]] = {
     MapCorrection: _correction,
     MapPose: _map_pose,
     Odometry: _odometry,
+    OrganizedCloud: _organized,
     PointCloud: _cloud,
     Submap: _submap,
     TransformBatch: _transforms,

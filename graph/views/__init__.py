@@ -19,7 +19,12 @@ from mapstream.graph.views.images import (
     view_camera_frame,
     view_encoded_image,
 )
-from mapstream.graph.views.lidar import view_laser_scan, view_lidar_scan, view_point_cloud
+from mapstream.graph.views.lidar import (
+    view_laser_scan,
+    view_lidar_scan,
+    view_organized_cloud,
+    view_point_cloud,
+)
 from mapstream.graph.views.localization import view_map_pose
 from mapstream.graph.views.mapping import (
     view_keyframe,
@@ -58,6 +63,7 @@ GROUP = "mapstream.views"
 
 _BUILT_IN: dict[type, View] = {
     sensors.LidarScan: view_lidar_scan,
+    sensors.OrganizedCloud: view_organized_cloud,
     sensors.CameraFrame: view_camera_frame,
     sensors.EncodedImage: view_encoded_image,
     sensors.ImuBatch: view_imu_batch,

@@ -10,7 +10,7 @@ from mapstream.graph.views.colors import ColorArray, photographed, ramp_colors
 from mapstream.graph.views.scene import BASE, Drawing, Scene, sensor_frame
 from mapstream.streams.arrays import Float32Array
 from mapstream.streams.messages.estimates import PointCloud
-from mapstream.streams.messages.sensors import LaserScan2D, LidarScan
+from mapstream.streams.messages.sensors import LaserScan2D, LidarScan, OrganizedCloud
 
 _POINT_SIZE = rr.Radius.ui_points(1.5)  # a scan of the moment, not yet in the map
 _BEAM_SIZE = rr.Radius.ui_points(3.0)
@@ -23,6 +23,20 @@ def view_lidar_scan(scan: LidarScan, scene: Scene) -> Drawing:
     colors = _point_colors(points, intensity, scene)
     cloud = rr.Points3D(points, colors=colors, radii=_POINT_SIZE)
     return [*mount, *scene.within("", sensor_frame(scan.frame), cloud)]
+
+
+def view_organized_cloud(cloud: OrganizedCloud, scene: Scene) -> Drawing:
+    """Draw the points where the camera sits, in their own colours, else by height."""
+    mount = scene.mount(cloud.frame, cloud.T_base_sensor)
+    is_seen = np.isfinite(cloud.points[..., 2])
+    seen = cloud.points[is_seen]
+    step = _step(len(seen), scene.settings.max_points)
+    points = seen[::step]
+    colors: ColorArray | npt.NDArray[np.uint8] = height_colors(points[:, 2], scene)
+    if cloud.colors_rgb is not None:
+        colors = cloud.colors_rgb[is_seen][::step]
+    drawn = rr.Points3D(points, colors=colors, radii=_POINT_SIZE)
+    return [*mount, *scene.within("", sensor_frame(cloud.frame), drawn)]
 
 
 def view_point_cloud(cloud: PointCloud, scene: Scene) -> Drawing:

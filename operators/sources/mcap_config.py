@@ -20,12 +20,14 @@ from mapstream.streams.messages.sensors import (
     ImuBatch,
     LaserScan2D,
     LidarScan,
+    OrganizedCloud,
     TransformBatch,
     WheelOdometry,
 )
 
 _TYPES: dict[str, type[Any]] = {  # by the name of a port
     "scans": LidarScan,
+    "organized": OrganizedCloud,
     "imu": ImuBatch,
     "frames": CameraFrame,
     "images": EncodedImage,

@@ -26,6 +26,7 @@ from mapstream.streams.messages.sensors import (
     ImuBatch,
     LaserScan2D,
     LidarScan,
+    OrganizedCloud,
     TransformBatch,
     WheelOdometry,
 )
@@ -38,6 +39,7 @@ _Read = Callable[..., Any]  # of a cursor or a protobuf message; clouds also tak
 _ROS: list[tuple[str, type[Any], _Read]] = [
     ("sensor_msgs/Imu", ImuBatch, ros.imu),
     ("sensor_msgs/PointCloud2", LidarScan, ros_clouds.PointCloudReader),
+    ("sensor_msgs/PointCloud2", OrganizedCloud, ros_clouds.OrganizedCloudReader),
     ("livox_ros_driver/CustomMsg", LidarScan, ros_clouds.livox),
     ("livox_ros_driver2/CustomMsg", LidarScan, ros_clouds.livox),
     ("sensor_msgs/Image", CameraFrame, ros_images.image),
@@ -128,8 +130,8 @@ def schema_key(channel: Channel) -> str:
 
 
 def _bound(channel: Channel, read: _Read, notices: Counter[str]) -> _Read:
-    if read is ros_clouds.PointCloudReader:
-        return ros_clouds.PointCloudReader(notices)
+    if read in (ros_clouds.PointCloudReader, ros_clouds.OrganizedCloudReader):
+        return read(notices)
     if read in (ros_clouds.livox, foxglove.point_cloud):
         return partial(read, notices=notices)
     if read is ros.transforms:

@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from mapstream.streams.arrays import Float32Array, IntArray
-from mapstream.streams.messages.sensors import LidarScan
+from mapstream.streams.messages.sensors import LidarScan, OrganizedCloud
 
 INTENSITY: Final = ("intensity", "intensities", "reflectivity", "i", "signal")
 RING: Final = ("ring", "line", "channel", "laser_id", "laserid", "row")
@@ -25,6 +25,7 @@ TIMES: Final = (
     "t", "time", "timestamp", "offset_time", "time_stamp", "time_offset", "timeoffset", "offset_ns",
     "t_offset", "point_time_offset",
 )  # fmt: skip
+COLORS: Final = ("rgb", "rgba")
 _ABSOLUTE_S, _ABSOLUTE_NS = 5e8, 1e16  # least seconds and nanoseconds since 1970 that are dates
 _MAX_SWEEP_S: Final = 10.0  # a relative time above it is not in seconds
 _MAX_FROM_STAMP_NS: Final = 2 * 10**9  # absolute times farther off are of another clock
@@ -142,6 +143,36 @@ def scan_of(
         offsets_ns=_offsets(points, layout, stamp_ns, notices),
         frame=frame or "lidar",
     )
+
+
+def organized_cloud_of(
+    points: npt.NDArray[np.void],
+    layout: CloudLayout,
+    size: CloudSize,
+    *,
+    stamp_ns: int,
+    frame: str,
+) -> OrganizedCloud:
+    """Make an organised cloud; a point with a coordinate that is not finite, or at the camera, is no point."""
+    xyz = _xyz(points, layout)
+    xyz[~(np.isfinite(xyz).all(axis=1) & (xyz != 0).any(axis=1))] = np.nan
+    shape = (size.rows, size.columns, 3)
+    colors_rgb = _colors_rgb(points)
+    return OrganizedCloud(
+        stamp_ns=stamp_ns,
+        points=xyz.reshape(shape),
+        colors_rgb=None if colors_rgb is None else colors_rgb.reshape(shape),
+        frame=frame or "camera",
+    )
+
+
+def _colors_rgb(points: npt.NDArray[np.void]) -> npt.NDArray[np.uint8] | None:
+    """Return the colours (N, 3); PCL packs blue, green and red into the first bytes of a number of any type."""
+    name = next((name for name in COLORS if name in (points.dtype.names or ())), None)
+    if name is None or points.dtype[name].itemsize != 4:
+        return None
+    packed = points[name].copy().view(np.uint8).reshape(-1, 4)
+    return np.ascontiguousarray(packed[:, 2::-1])
 
 
 def _xyz(points: npt.NDArray[np.void], layout: CloudLayout) -> Float32Array:

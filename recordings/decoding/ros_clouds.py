@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
@@ -13,10 +14,11 @@ from mapstream.recordings.decoding.point_fields import (
     CloudSize,
     PointField,
     layout_of,
+    organized_cloud_of,
     points_view,
     scan_of,
 )
-from mapstream.streams.messages.sensors import LidarScan
+from mapstream.streams.messages.sensors import LidarScan, OrganizedCloud
 
 _DTYPES = {1: "i1", 2: "u1", 3: "<i2", 4: "<u2", 5: "<i4", 6: "<u4", 7: "<f4", 8: "<f8"}
 _LIVOX = layout_of(
@@ -33,6 +35,17 @@ _LIVOX = layout_of(
 )
 
 
+@dataclass(frozen=True, slots=True)
+class CloudView:
+    """A sensor_msgs/PointCloud2."""
+
+    points: npt.NDArray[np.void]  # (N,) of the layout, row by row
+    layout: CloudLayout
+    size: CloudSize
+    stamp_ns: int
+    frame: str
+
+
 class PointCloudReader:
     """Reads the sensor_msgs/PointCloud2 of one topic; a field table that repeats is parsed once."""
 
@@ -45,11 +58,17 @@ class PointCloudReader:
         )  # where the layout was in its message, and its bytes
 
     def __call__(self, cursor: CdrCursor) -> LidarScan:
-        points, layout, stamp_ns, frame = self.view(cursor)
-        return scan_of(points, layout, stamp_ns=stamp_ns, frame=frame, notices=self._notices)
+        seen = self.view(cursor)
+        return scan_of(
+            seen.points,
+            seen.layout,
+            stamp_ns=seen.stamp_ns,
+            frame=seen.frame,
+            notices=self._notices,
+        )
 
-    def view(self, cursor: CdrCursor) -> tuple[npt.NDArray[np.void], CloudLayout, int, str]:
-        """Return the points as a structured view on the message, their layout, stamp and frame."""
+    def view(self, cursor: CdrCursor) -> CloudView:
+        """Return what a message holds, without a copy."""
         stamp_ns, frame = cursor.header()
         height, width = cursor.u32(), cursor.u32()
         layout = self._read_layout(cursor)
@@ -57,8 +76,8 @@ class PointCloudReader:
         data = cursor.raw(cursor.u32())
         cursor.u8()  # is_dense: drivers that set it still send points that are not finite
         cursor.end()
-        points = points_view(data, layout, CloudSize(height, width, row_bytes))
-        return points, layout, stamp_ns, frame
+        size = CloudSize(height, width, row_bytes)
+        return CloudView(points_view(data, layout, size), layout, size, stamp_ns, frame)
 
     def _read_layout(self, cursor: CdrCursor) -> CloudLayout:
         """Read from the number of fields to the size of a point."""
@@ -74,6 +93,25 @@ class PointCloudReader:
         self._layout = layout_of(tuple(field for field in fields if field), point_bytes)
         self._table_start, self._table = start, bytes(cursor.data[start : cursor.position])
         return self._layout
+
+
+class OrganizedCloudReader(PointCloudReader):
+    """Reads those that have the rows and columns of an image, as drivers of depth cameras publish them."""
+
+    def __call__(self, cursor: CdrCursor) -> OrganizedCloud:  # type: ignore[override]  # the same bytes, seen as an image
+        """Read one.
+
+        Raises:
+            ValueError: If all points are in one row.
+        """
+        seen = self.view(cursor)
+        if seen.size.rows < 2:
+            raise ValueError(
+                f"{seen.size.columns} points in {seen.size.rows} row: no organised cloud, read it as LidarScan"
+            )
+        return organized_cloud_of(
+            seen.points, seen.layout, seen.size, stamp_ns=seen.stamp_ns, frame=seen.frame
+        )
 
 
 def _field(cursor: CdrCursor) -> PointField | None:

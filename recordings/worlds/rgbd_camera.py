@@ -4,17 +4,19 @@ from __future__ import annotations
 
 from typing import Literal
 
+import cv2
 import numpy as np
 import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict, Field, NonNegativeFloat, PositiveFloat
 
 from mapstream.recordings.worlds.depth_camera import with_depth_noise
+from mapstream.recordings.worlds.people import People
 from mapstream.recordings.worlds.photographs import Film, compress
 from mapstream.recordings.worlds.renderer import Pinhole, Renderer, Rendering
 from mapstream.streams.arrays import FloatArray
 from mapstream.streams.calibration import CameraCalibration
 from mapstream.streams.geometry import SE3
-from mapstream.streams.messages.sensors import CameraFrame, EncodedImage, LidarScan
+from mapstream.streams.messages.sensors import CameraFrame, EncodedImage, OrganizedCloud
 
 COLOR, DEPTH = "color", "depth"
 _FILM, _DEPTH_NOISE = 7, 8  # apart from all that takes chance from the seed alone
@@ -39,7 +41,7 @@ class RgbdCameraConfig(BaseModel):
     quality: int = Field(default=90, ge=1, le=100)
     """Of JPEG."""
     clouds: bool = False
-    """Writes `/points` as well: the same depths as points, row by row; `ring` is the row."""
+    """Writes `/points` as well: the same depths and colours as organised clouds."""
 
     def calibration(self, frame: str) -> CameraCalibration:
         """Return how the camera sees, under the name of either of its images."""
@@ -58,9 +60,15 @@ class RgbdCamera:
     """One camera in one world. A view is the same whichever is taken first."""
 
     def __init__(
-        self, config: RgbdCameraConfig, renderer: Renderer, T_base_camera: SE3, seed: int
+        self,
+        config: RgbdCameraConfig,
+        renderer: Renderer,
+        T_base_camera: SE3,
+        seed: int,
+        people: People | None = None,
     ) -> None:
         self._config, self._renderer, self._seed = config, renderer, seed
+        self._people = people
         self._T_base_camera = T_base_camera
         lens = config.calibration(COLOR)
         (fx, fy), (cx, cy) = lens.focal_px.tolist(), lens.center_px.tolist()
@@ -71,14 +79,21 @@ class RgbdCamera:
         self._rays = np.stack([*np.meshgrid(u, v), np.ones((len(v), len(u)))], axis=2)  # of depth 1
 
     def ideal(self, T_world_camera: FloatArray) -> Rendering:
-        """Return what is seen from a pose (4, 4), without noise: colours, inverse depths, surfaces."""
+        """Return what is seen of the room from a pose (4, 4), without noise: colours, inverse depths, surfaces."""
         return self._renderer.rendering(self._pinhole, T_world_camera)
+
+    def ideal_at(self, stamp_ns: int, T_world_camera: FloatArray) -> Rendering:
+        """Return what is seen from a pose (4, 4) at a time, without noise: the room and the people in it."""
+        view = self.ideal(T_world_camera)
+        if self._people is None:
+            return view
+        return self._people.in_front_of(view, self._pinhole, stamp_ns, T_world_camera)
 
     def take(
         self, number: int, stamp_ns: int, T_world_camera: FloatArray
     ) -> tuple[EncodedImage, CameraFrame]:
         """Return the colour and the depth image with a number, of a pose (4, 4)."""
-        config, view = self._config, self.ideal(T_world_camera)
+        config, view = self._config, self.ideal_at(stamp_ns, T_world_camera)
         color = EncodedImage(
             stamp_ns=stamp_ns,
             data=compress(self._film.expose(view.image, number), config.format, config.quality),
@@ -107,15 +122,15 @@ class RgbdCamera:
         )
         return measured
 
-    def cloud(self, depth: CameraFrame) -> LidarScan:
-        """Return the points of a depth image, without the pixels that saw nothing."""
+    def cloud(self, color: EncodedImage, depth: CameraFrame) -> OrganizedCloud:
+        """Return a colour and a depth image as the points of their pixels."""
         depth_m = depth.image / 1000.0
-        seen = depth_m > 0
-        rows = np.broadcast_to(np.arange(depth_m.shape[0])[:, None], depth_m.shape)
-        return LidarScan(
+        points = self._rays * np.where(depth_m > 0, depth_m, np.nan)[:, :, None]
+        bgr = np.asarray(cv2.imdecode(color.data, cv2.IMREAD_COLOR), np.uint8)
+        return OrganizedCloud(
             stamp_ns=depth.stamp_ns,
-            points=(self._rays * depth_m[:, :, None])[seen].astype(np.float32),
-            ring=rows[seen].astype(np.uint16),
+            points=points.astype(np.float32),
+            colors_rgb=np.ascontiguousarray(bgr[:, :, ::-1]),
             frame=DEPTH,
             T_base_sensor=self._T_base_camera,
         )

@@ -11,6 +11,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, NonNegativeFloat, PositiveFloat
 
 from mapstream.recordings.worlds.orbit import orbit
+from mapstream.recordings.worlds.people import People
 from mapstream.recordings.worlds.photographs import in_order
 from mapstream.recordings.worlds.renderer import Renderer
 from mapstream.recordings.worlds.rgbd_camera import COLOR, DEPTH, RgbdCamera, RgbdCameraConfig
@@ -52,6 +53,10 @@ class WRgbdConfig(BaseModel):
     """Of the pictures on all surfaces; a coarse one is made sooner."""
     odometry_drift: NonNegativeFloat = 0.01
     """Of the topic `/odometry`, as a part of the distance."""
+    people: int = Field(default=0, ge=0, le=5)
+    """So many walk about beyond the table."""
+    without: tuple[str, ...] = ()
+    """Things and furniture that are not there: cupboard, crate, or a class of things."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -65,7 +70,10 @@ class RgbdWorld:
 def rgbd_world(config: WRgbdConfig, seed: int) -> RgbdWorld:
     """Return the truth behind a recording: surfaces, things, and ideal depth from any pose."""
     room = rgbd_room(seed if config.room_seed is None else config.room_seed, texel_m=config.texel_m)
-    return RgbdWorld(room, RgbdCamera(config.camera, Renderer(room.surfaces), T_BASE_CAMERA, seed))
+    room = room.without(config.without)
+    people = People(config.people, seed, START_NS, texel_m=config.texel_m)
+    renderer = Renderer(room.surfaces)
+    return RgbdWorld(room, RgbdCamera(config.camera, renderer, T_BASE_CAMERA, seed, people))
 
 
 def w_rgbd(config: WRgbdConfig, seed: int) -> Simulation:
@@ -107,7 +115,7 @@ def _records(
     yield Record(color.stamp_ns, "/color/image", color)
     yield Record(depth.stamp_ns, "/depth/image", depth)
     if config.camera.clouds:
-        yield Record(depth.stamp_ns, "/points", camera.cloud(depth))
+        yield Record(depth.stamp_ns, "/points", camera.cloud(color, depth))
 
 
 def _true_things(room: Room) -> TransformBatch:

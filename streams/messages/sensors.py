@@ -84,6 +84,22 @@ class CameraFrame:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class OrganizedCloud:
+    """The points that the pixels of a depth camera see, row by row, in the camera's frame."""
+
+    stamp_ns: int
+    points: Float32Array  # (H, W, 3) [m]; nan where nothing was seen
+    colors_rgb: npt.NDArray[np.uint8] | None = None  # (H, W, 3)
+    frame: str = "camera"
+    T_base_sensor: SE3 = field(default_factory=SE3.identity)
+    record: RecordRef | None = None
+
+    def __post_init__(self) -> None:
+        height, width, _ = frozen(self, "points", np.float32, (None, None, 3)).shape
+        frozen_optional(self, "colors_rgb", np.uint8, (height, width, 3))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class EncodedImage:
     """One compressed image, as recorded."""
 

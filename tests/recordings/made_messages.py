@@ -34,6 +34,7 @@ from mapstream.streams.messages.sensors import (
     ImuBatch,
     LaserScan2D,
     LidarScan,
+    OrganizedCloud,
     RecordRef,
     TransformBatch,
     WheelOdometry,
@@ -128,6 +129,10 @@ def one_of_each(seed: int) -> list[Any]:
     )  # fmt: skip
     return [
         loop,
+        OrganizedCloud(
+            stamp_ns=stamp, points=rng.normal(size=(2, n, 3)).astype(np.float32), T_base_sensor=pose(),
+            colors_rgb=maybe(rng.integers(0, 255, (2, n, 3), np.uint8)), record=maybe(ref),
+        ),
         LidarScan(
             stamp_ns=stamp, points=points, intensity=maybe(intensity),
             ring=maybe(np.arange(n, dtype=np.uint16)), offsets_ns=maybe(np.arange(n) - 2),

@@ -18,7 +18,7 @@ from mapstream.streams.messages.estimates import Odometry
 from mapstream.streams.messages.sensors import (
     CameraFrame,
     EncodedImage,
-    LidarScan,
+    OrganizedCloud,
     TransformBatch,
 )
 from mapstream.streams.sensors import CameraSensor
@@ -64,14 +64,15 @@ def test_R9_the_same_seed_gives_the_same_bytes(tmp_path: Path) -> None:
 
 
 def test_A7_clouds_are_the_depth_images(messages: list[Any]) -> None:
-    """Point by point: a cloud's rows and its points are the pixels that saw something."""
-    depths, clouds = of_type(messages, CameraFrame), of_type(messages, LidarScan)
+    """Pixel by pixel."""
+    depths, clouds = of_type(messages, CameraFrame), of_type(messages, OrganizedCloud)
     assert len(depths) == len(clouds) == len(of_type(messages, EncodedImage)) == 9
     for depth, cloud in zip(depths, clouds, strict=True):
         seen = depth.image > 0
         assert depth.encoding == "16UC1"
-        np.testing.assert_allclose(cloud.points[:, 2], depth.image[seen] / 1000.0, atol=1e-6)
-        np.testing.assert_array_equal(cloud.ring, np.nonzero(seen)[0])
+        np.testing.assert_allclose(cloud.points[seen, 2], depth.image[seen] / 1000.0, atol=1e-6)
+        assert np.isnan(cloud.points[~seen]).all()
+        assert cloud.colors_rgb.shape == cloud.points.shape
 
 
 def test_points_lie_on_the_surfaces_that_the_world_tells(messages: list[Any]) -> None:
@@ -87,8 +88,8 @@ def test_points_lie_on_the_surfaces_that_the_world_tells(messages: list[Any]) ->
     assert seen.mean() > 0.8
     assert np.std(noise_m / sigma_m) == pytest.approx(1.0, abs=0.06)
     assert abs(np.mean(noise_m / sigma_m)) < 0.05
-    cloud = of_type(messages, LidarScan)[3]
-    points = cloud.points @ T[:3, :3].T + T[:3, 3]
+    cloud = of_type(messages, OrganizedCloud)[3]
+    points = cloud.points[depth.image > 0] @ T[:3, :3].T + T[:3, 3]
     rows = view.surfaces[depth.image > 0]
     normals, origins = (
         np.stack([getattr(s, name) for s in world.room.surfaces]) for name in ("normal", "origin")
