@@ -21,12 +21,12 @@ from mapstream.operators.planes.plane_pose import PlaneNoise, PlaneSet, pose_fro
 from mapstream.operators.planes.seen_plane import SeenPlane
 from mapstream.recordings.maps.hulls import moved_hull
 from mapstream.streams.arrays import BoolArray, FloatArray, IntArray
-from mapstream.streams.geometry import SE3, invert, so3_log
+from mapstream.streams.geometry import SE3, invert
 
 _LEAST_SINE = 0.5  # between planes that give a rotation
 _LEAST_VOLUME = 0.3  # determinant of three normals that give a shift
 _MOST_TRIPLES = 1500  # by rotation
-_MOST_TRIED = 40  # places that are fitted
+_MOST_TRIED = 24  # places that are fitted
 _ALIKE_RAD, _ALIKE_M = 0.1, 0.15  # rotations and shifts so near are one
 _LEAST_WITHIN = 0.1  # of an outline, on a known one
 
@@ -134,26 +134,26 @@ def _rotations(
     """Return rotations (3, 3) by which two planes face as two known ones; nearly equal ones once."""
     cosines = known.normals @ known.normals.T
     order = np.argsort(-weights, kind="stable")
-    found: list[FloatArray] = []
+    found = np.empty((0, 9))
     for i, j in list(combinations(order.tolist(), 2))[: 2 * len(order)]:
         cosine = seen.normals[i] @ seen.normals[j]
         if np.sqrt(max(1 - cosine**2, 0.0)) < _LEAST_SINE:
             continue
         angles = np.arccos(np.clip(cosines, -1, 1)) - np.arccos(np.clip(cosine, -1, 1))
+        rows, columns = np.nonzero(np.abs(angles) < limits.angle_rad)
         axes = _axes(seen.normals[i], seen.normals[j])
-        for a, b in np.argwhere(np.abs(angles) < limits.angle_rad).tolist():
-            R = _axes(known.normals[a], known.normals[b]) @ axes.T
-            if all(np.linalg.norm(so3_log(R.T @ other)) > _ALIKE_RAD for other in found):
-                found.append(R)
-    return found
+        for R in _axes(known.normals[rows], known.normals[columns]) @ axes.T:
+            if not (found @ R.ravel() > 1 + 2 * np.cos(_ALIKE_RAD)).any():  # traces of R.T @ other
+                found = np.concatenate([found, R.reshape(1, 9)])
+    return list(found.reshape(-1, 3, 3))
 
 
 def _axes(a: FloatArray, b: FloatArray) -> FloatArray:
-    """Return axes (3, 3) that two directions span, half of their error on either."""
-    x = (a + b) / np.linalg.norm(a + b)
-    z = np.cross(a, b)
-    z = z / np.linalg.norm(z)
-    return np.column_stack([x, np.cross(z, x), z])
+    """Return axes (..., 3, 3) that two directions (..., 3) span, half of their error on either."""
+    x, z = a + b, np.cross(a, b)
+    x = x / np.linalg.norm(x, axis=-1, keepdims=True)
+    z = z / np.linalg.norm(z, axis=-1, keepdims=True)
+    return np.stack([x, np.cross(z, x), z], axis=-1)
 
 
 def _shifted(
