@@ -31,6 +31,7 @@ VERBS = {  # verb -> function or group of commands, and what a list of verbs say
     "map": ("map:app", "Import, export, check, edit, merge or optimise a map."),
     "batch": ("batch:batch", "Run map commands from a file, one after another."),
     "eval": ("evaluate:evaluate", "Compare a trajectory or map with a reference."),
+    "compare": ("compare:compare", "Compare graphs, or choices in one, on a recording."),
     "models": ("models:app", "List and install trained networks."),
     "localize": ("localize:localize", "Find a robot in a map that was made before."),
     "check-plugin": ("plugins:check_plugin", "Check the operators of another package."),
