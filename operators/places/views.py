@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
+from mapstream.operators.landmarks.motion import Motion, moments
 from mapstream.operators.landmarks.sensors import T_base_sensor_of
 from mapstream.operators.places.geometry.sightings import Sensor
 from mapstream.operators.places.indices.index import Descriptors
@@ -27,7 +29,7 @@ class View:
     sensor: Sensor
     descriptors: Descriptors  # (N, D)
     keypoints_px: FloatArray  # (N, 2)
-    points_sensor: FloatArray  # (N, 3) [m]; NaN where only a ray is known
+    points_sensor: FloatArray  # (N, 3) [m] at one moment; NaN where only a ray is known
     sigmas_m: FloatArray  # (N,)
     rows: IntArray  # (N,) of observations in the map, or of the message
 
@@ -80,16 +82,32 @@ class VertexViews:
             if not len(rows):
                 continue
             seen = map_.observations
+            sensor = self._sensor(vertex, map_.feature_sets.sensor[row], rows)
             yield View(
                 kind=map_.feature_sets.kind[row],
                 frame=map_.feature_sets.sensor[row],
-                sensor=self._sensor(vertex, map_.feature_sets.sensor[row], rows),
+                sensor=sensor,
                 descriptors=descriptors_of(map_, rows),
                 keypoints_px=seen.keypoint_px[rows].astype(np.float64),
-                points_sensor=seen.p_sensor[rows].astype(np.float64),
+                points_sensor=self._points_at_vertex(vertex, rows, sensor.T_base_sensor),
                 sigmas_m=seen.sigma_m[rows].astype(np.float64),
                 rows=rows,
             )
+
+    def _points_at_vertex(self, vertex: int, rows: IntArray, T_base_sensor: SE3) -> FloatArray:
+        """Return the 3D points (N, 3) as the sensor would have seen them at the vertex, not within its sweep."""
+        seen = self._map.observations
+        points, offsets_ns = seen.p_sensor[rows].astype(np.float64), seen.offset_ns[rows]
+        swept = np.flatnonzero(np.isfinite(points[:, 0]) & (offsets_ns != 0))
+        if len(swept):
+            at = moments(self._motion, np.full(len(swept), vertex), offsets_ns[swept])
+            T = T_base_sensor.inverse().matrix @ at.T_vertex_moment @ T_base_sensor.matrix
+            points[swept] = np.einsum("nij,nj->ni", T[:, :3, :3], points[swept]) + T[:, :3, 3]
+        return points
+
+    @cached_property
+    def _motion(self) -> Motion:
+        return Motion.of(self._map)
 
     def _sensor(self, vertex: int, name: str, rows: IntArray) -> Sensor:
         key = (int(self._map.vertices.mission[vertex]), name)
