@@ -45,7 +45,9 @@ class LearnedFeatures(FeatureFinder):
 
     def detect(self, frame: CameraFrame) -> ImageFeatures:
         """Find the keypoints of one image, the best first."""
-        network = self._network or self.open()
+        if self._network is None:
+            self._network = self.open()
+        network = self._network
         found = network.find(gray(frame))
         sigmas_px = np.full(len(found.px), self._sigma_px, np.float32)
         return features_in(

@@ -1,0 +1,1 @@
+"""LiDAR scans as images, and keypoints with 3D points that are found in them."""
