@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 
@@ -33,6 +34,13 @@ class Room:
 
     surfaces: tuple[Surface, ...]
     things: tuple[Thing, ...]
+
+    def without(self, names: Sequence[str]) -> Room:
+        """Return the room after somebody carried away what has one of these names."""
+        return Room(
+            tuple(surface for surface in self.surfaces if surface.name not in names),
+            tuple(thing for thing in self.things if thing.name not in names),
+        )
 
 
 def rgbd_room(seed: int, *, texel_m: float) -> Room:
