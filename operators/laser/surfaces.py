@@ -49,6 +49,8 @@ def surface_of(points: FloatArray, eye: FloatArray) -> Surface:
         points: (N, 2) in the order of the beams.
         eye: (2,) where the laser was.
     """
+    if not len(points):
+        return Surface(points, points)
     padding = np.full((_NUM_NEIGHBOURS, 2), np.nan)
     padded = np.concatenate([padding, points, padding])
     windows = np.lib.stride_tricks.sliding_window_view(padded, 2 * _NUM_NEIGHBOURS + 1, axis=0)

@@ -17,7 +17,7 @@ from mapstream.operators.lidar.loops import Outputs as LoopOutputs
 from mapstream.operators.lidar.sampling import voxel_keys
 from mapstream.operators.odometry.gicp_odometry import GicpOdometry, GicpOdometryConfig
 from mapstream.operators.odometry.kiss_odometry import KissOdometry, KissOdometryConfig
-from mapstream.operators.operator import Context, set_context
+from mapstream.operators.operator import Context, Operator, set_context
 from mapstream.operators.submaps.keyframes import Keyframes, KeyframesConfig
 from mapstream.operators.submaps.submap_builder import SubmapBuilder, SubmapBuilderConfig
 from mapstream.operators.testing import run_operator
@@ -89,7 +89,9 @@ async def submaps_of(tracked: Tracked) -> list[Submap]:
     return out["submaps"]
 
 
-async def map_of(submaps: list[Submap], config: LidarLoopsConfig) -> list[Map]:
+async def map_of(
+    submaps: list[Submap], config: LidarLoopsConfig, search_loops: Operator[Any, Any] | None = None
+) -> list[Map]:
     """Run loop search and optimizer beside each other, each waiting for the other."""
     to_loops: Channel[Any] = Channel("submaps", UNBOUNDED)
     to_optimizer: Channel[Any] = Channel("submaps", UNBOUNDED)
@@ -108,7 +110,7 @@ async def map_of(submaps: list[Submap], config: LidarLoopsConfig) -> list[Map]:
 
     async def search() -> None:
         inputs = LoopInputs(receive(to_loops), receive(corrections))
-        await LidarLoops(config).run(inputs, LoopOutputs(Sender([loops])))
+        await (search_loops or LidarLoops(config)).run(inputs, LoopOutputs(Sender([loops])))
         loops.close()
 
     async def optimize() -> None:
