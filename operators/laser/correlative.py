@@ -18,7 +18,7 @@ import numpy.typing as npt
 from mapstream.operators.laser.planar import apply
 from mapstream.streams.arrays import FloatArray, IntArray
 
-_TOP_LEVEL = 4  # blocks of 16 x 16 poses
+_NUM_LEVELS = 4  # up to blocks of 16 x 16 poses
 _BATCH = 64  # blocks that are looked into together
 _MAX_POINTS = 150
 _MAX_SIDE = 4096  # cells of a grid
@@ -47,8 +47,14 @@ class LikelihoodGrid:
     """How likely a point is to lie in a cell, by its distance from the nearest of the target's points."""
 
     def __init__(
-        self, points: FloatArray, *, resolution_m: float = 0.05, sigma_m: float = 0.1
+        self,
+        points: FloatArray,
+        *,
+        resolution_m: float = 0.05,
+        sigma_m: float = 0.1,
+        num_levels: int = _NUM_LEVELS,
     ) -> None:
+        """Make the pyramid; more levels make wide windows fast, and narrow ones slow."""
         margin_m = 4 * sigma_m
         self.resolution_m = resolution_m
         self._origin_m = points.min(axis=0) - margin_m
@@ -61,7 +67,7 @@ class LikelihoodGrid:
         far = cv2.distanceTransform(empty, cv2.DIST_L2, cv2.DIST_MASK_PRECISE) * resolution_m
         likelihood = np.exp(-0.5 * (far / sigma_m) ** 2)
         self._levels: list[Bytes] = [np.round(255 * likelihood).astype(np.uint8)]
-        for level in range(1, _TOP_LEVEL + 1):
+        for level in range(1, num_levels + 1):
             self._levels.append(_block_maxima(self._levels[-1], 2 ** (level - 1)))
 
     def cells(self, points: FloatArray) -> IntArray:
@@ -69,8 +75,13 @@ class LikelihoodGrid:
         cells: IntArray = np.floor((points - self._origin_m) / self.resolution_m).astype(np.int64)
         return cells
 
-    def search(self, points: FloatArray, guess: FloatArray, window: Window) -> Basin:
-        """Return the likeliest pose of points (N, 2) within the window; of equals one, always the same."""
+    def search(
+        self, points: FloatArray, guess: FloatArray, window: Window, least_score: float = 0.0
+    ) -> Basin:
+        """Return the likeliest pose of points (N, 2) within the window; of equals one, always the same.
+
+        The search ends when no pose can reach `least_score`: the pose is then a rough one, with a lower score.
+        """
         if len(points) > _MAX_POINTS:
             points = points[np.linspace(0, len(points) - 1, _MAX_POINTS).astype(int)]
         num_turns = int(np.ceil(window.turn_rad / window.turn_step_rad))
@@ -78,18 +89,20 @@ class LikelihoodGrid:
         starts = guess + turns[:, None] * np.array([0.0, 0.0, 1.0])
         cells = np.array([self.cells(apply(start, points)) for start in starts])
         reach = int(np.ceil(window.radius_m / self.resolution_m))
-        shifts = np.arange(-reach, reach + 1, 2**_TOP_LEVEL)
+        shifts = np.arange(-reach, reach + 1, 2 ** (len(self._levels) - 1))
         first = np.stack(np.meshgrid(np.arange(len(turns)), shifts, shifts, indexing="ij"), -1)
-        best, score = self._best(cells, first.reshape(-1, 3), reach)
+        best, score = self._best(cells, first.reshape(-1, 3), reach, least_score)
         shift_m = best[1:] * self.resolution_m
         pose = np.append(guess[:2] + shift_m, guess[2] + turns[best[0]])
         return Basin(pose, score)
 
-    def _best(self, cells: IntArray, blocks: IntArray, reach: int) -> tuple[IntArray, float]:
+    def _best(
+        self, cells: IntArray, blocks: IntArray, reach: int, least_score: float
+    ) -> tuple[IntArray, float]:
         """Look into the blocks that promise most, until one pose is better than all other blocks can be."""
         heap: list[tuple[float, int, tuple[int, ...]]] = []
-        self._push(heap, cells, blocks, _TOP_LEVEL)
-        while heap[0][1] > 0:
+        self._push(heap, cells, blocks, len(self._levels) - 1)
+        while heap[0][1] > 0 and -heap[0][0] >= least_score:
             level = heap[0][1]
             batch = [heapq.heappop(heap)]
             while heap and len(batch) < _BATCH and heap[0][1] == level:

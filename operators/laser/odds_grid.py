@@ -28,8 +28,8 @@ class OddsConfig(OperatorConfig):
 
     resolution_m: PositiveFloat = 0.05
     """Side of a cell."""
-    hit: float = Field(default=0.7, gt=0.5, lt=1.0, description="probability, of one scan")
-    passed: float = Field(default=0.4, gt=0.0, lt=0.5, description="the same, of being occupied")
+    hit: float = Field(default=0.85, gt=0.5, lt=1.0, description="probability, of one scan")
+    passed: float = Field(default=0.2, gt=0.0, lt=0.5, description="the same, of being occupied")
     most: float = Field(
         default=0.98, gt=0.5, lt=1.0, description="no cell is more certain, so that maps can change"
     )

@@ -78,6 +78,11 @@ class Drift:
         return self._T_map_odom is None or len(self._contradicting) >= _IN_DOUBT
 
     @property
+    def estimate(self) -> SE3 | None:
+        """Where the odometry's frame lies in the map, also while that is in doubt; None as long as nobody knows."""
+        return self._T_map_odom
+
+    @property
     def covariance(self) -> FloatArray:
         """Of `T_map_base`, (6, 6)."""
         return self._covariance

@@ -41,7 +41,7 @@ def test_a_beam_clears_its_way_and_fills_its_end() -> None:
     assert grid.stamp_ns == 3
     assert [at(grid, x, 0.05) < 15 for x in np.arange(-0.55, 0.9, 0.1)] == [True] * 15
     assert at(grid, 1.05, 0.05) == 98
-    assert at(grid, 0.35, 0.35) == 70
+    assert at(grid, 0.35, 0.35) == 85
     assert at(grid, 0.35, 0.15) == -1
 
 
@@ -53,8 +53,8 @@ def test_a_scan_counts_a_cell_once_and_hits_win() -> None:
 
     grid = odds.grid(0)
 
-    assert at(grid, 0.55, 0.05) == 70
-    assert at(grid, 0.25, 0.05) == 40
+    assert at(grid, 0.55, 0.05) == 85
+    assert at(grid, 0.25, 0.05) == 20
 
 
 def test_what_moved_away_is_cleared() -> None:
