@@ -128,6 +128,7 @@ def _paint(
         sums = np.bincount(which[known], weight[known] * rgb[known, axis], minlength=len(targets))
         mean = np.divide(sums, added, out=np.zeros_like(sums), where=added > 0)
         old = volume.rgb[row, voxel, axis].astype(np.float64)
+        old = np.where(np.isnan(old) & (added > 0), mean, old)
         volume.rgb[row, voxel, axis] = old + share * (mean - old)
 
 

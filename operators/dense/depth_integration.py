@@ -105,6 +105,7 @@ def _paint(volume: TsdfVolume, rows: IntArray, color: ColorView, added: Float32A
     block, voxel, new = rows[block[is_in]], voxel[is_in], added.ravel()[at[is_in]]
     share = (new / (volume.weight[block, voxel] + new))[:, None]
     old = volume.rgb[block, voxel].astype(np.float32)
+    old = np.where(np.isnan(old), seen, old)
     volume.rgb[block, voxel] = (old + share * (seen - old)).astype(np.float16)
 
 

@@ -105,14 +105,18 @@ def fuse(
     of_cloud = CloudIntegration(
         carves=config.carves, fills_free_space=fills_free_space, uses_normals=config.uses_normals
     )
-    num_views = 0
+    num_views, has_seen_colors = 0, False
     for view in views:
         if isinstance(view, DepthView):
+            has_seen_colors |= view.color is not None
             integrate_depth(volume, view, of_depth)
         else:
+            has_seen_colors |= view.rgb is not None
             integrate_cloud(volume, view, of_cloud)
         num_views += 1
         on_progress(min(1.0, num_views / len(rows)))
+    if not has_seen_colors:
+        volume.drop_colors()
     report = FusionReport(
         source=source,
         num_views=num_views,

@@ -86,8 +86,12 @@ class TsdfVolume:
 
     @property
     def rgb(self) -> npt.NDArray[np.float16] | None:
-        """Return the colours (B, VOXELS, 3), 0 to 255, to be written by who integrates."""
+        """Return the colours (B, VOXELS, 3), 0 to 255, NaN where no camera saw any, to be written by who integrates."""
         return None if self._rgb is None else self._rgb[: len(self)]
+
+    def drop_colors(self) -> None:
+        """Forget the colours, as where no camera saw any."""
+        self._rgb = None
 
     @property
     def _bytes_of_block(self) -> int:
@@ -143,7 +147,7 @@ class TsdfVolume:
         self._distance_m = _grown(self._distance_m, capacity)
         self._weight = _grown(self._weight, capacity)
         if self._rgb is not None:
-            self._rgb = _grown(self._rgb, capacity)
+            self._rgb = _grown(self._rgb, capacity, np.nan)
 
 
 def observed(volume: TsdfVolume, min_weight: float) -> BoolArray:
@@ -151,8 +155,8 @@ def observed(volume: TsdfVolume, min_weight: float) -> BoolArray:
     return volume.weight > min_weight
 
 
-def _grown(array: npt.NDArray[Any], capacity: int) -> npt.NDArray[Any]:
-    grown = np.zeros((capacity, *array.shape[1:]), array.dtype)
+def _grown(array: npt.NDArray[Any], capacity: int, fill: float = 0) -> npt.NDArray[Any]:
+    grown = np.full((capacity, *array.shape[1:]), fill, array.dtype)
     grown[: len(array)] = array
     return grown
 

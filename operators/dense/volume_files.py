@@ -30,7 +30,7 @@ def save_volume(path: Path, volume: TsdfVolume) -> None:
         "truncation_m": np.float64(volume.truncation_m),
     }
     if volume.rgb is not None:
-        arrays["rgb"] = np.round(volume.rgb).astype(np.uint8).reshape(*cubes, 3)
+        arrays["rgb"] = np.round(np.nan_to_num(volume.rgb)).astype(np.uint8).reshape(*cubes, 3)
     write_arrays(path, arrays)
 
 

@@ -49,8 +49,9 @@ def test_O5_space_is_free_occupied_or_unknown(field: DistanceField) -> None:
     """Free before the ball, occupied at it, unknown inside it and beyond the field."""
     along = np.array([0.0, 1.0, 0.0])
     points = [CENTER + r * along for r in (0.8, RADIUS_M - 0.01, 0.1)]
+    outside = np.array([99.0, 0, 0])
 
-    states = field.states([*points, [99.0, 0, 0]])
+    states = field.states(np.array([*points, outside]))
 
     assert states.tolist() == [State.FREE, State.OCCUPIED, State.UNKNOWN, State.UNKNOWN]
     assert np.isnan(field.distances([[99.0, 0, 0]])).all()
