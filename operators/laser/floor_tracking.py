@@ -108,6 +108,8 @@ class FloorTracker:
             pose = lifted(found.pose)
             fixed = lifted_covariance(covariance, *_GROUND)
             self._drift.correct(Fix(stamp_ns, pose, fixed, T_odom_base))
+            if self._is_there(found.pose, T_odom_base):
+                self._num_misfits = 0
         return self._answer(stamp_ns, T_odom_base, fit, verdict)
 
     def _followed(self, surface: Surface, T_odom_base: SE3) -> ScanMatch | None:
@@ -122,10 +124,18 @@ class FloorTracker:
         if T_map_odom is not None:
             guess = flattened(T_map_odom @ T_odom_base)
             found = self._matched(surface, guess, _NEAR, config.min_fit)
-        self._num_misfits = 0 if found is not None else self._num_misfits + 1
+        self._num_misfits += found is None
         if self._num_misfits == 1:
             self._recent.clear()
         return found
+
+    def _is_there(self, pose: FloatArray, T_odom_base: SE3) -> bool:
+        """Return whether a pose (3,) is where the robot is believed to be now."""
+        T_map_odom = self._drift.estimate
+        if T_map_odom is None:
+            return False
+        off = difference(flattened(T_map_odom @ T_odom_base), pose)
+        return bool(np.hypot(off[1], off[2]) < _NEAR.search_distance_m)
 
     def _searched(self, stamp_ns: int, surface: Surface, T_odom_base: SE3) -> ScanMatch | None:
         """Gather scans, and search for them from time to time; return the match of the newest."""
@@ -169,7 +179,7 @@ class FloorTracker:
 
     def _answer(self, stamp_ns: int, T_odom_base: SE3, num_fitting: int, verdict: str) -> MapPose:
         T_map_odom = self._drift.T_map_odom(stamp_ns)
-        if self._num_misfits >= self._config.max_misfits and num_fitting == 0:
+        if self._num_misfits >= self._config.max_misfits:
             T_map_odom = None
         is_back = T_map_odom is not None and self._has_tracked and not self._was_tracking
         self._was_tracking = T_map_odom is not None
