@@ -48,14 +48,16 @@ class Room:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Office:
-    """What stands on a floor; its lower left inner corner is the origin, its long side lies along x."""
+    """What stands on a floor; amid the southern corridor is the origin, along it lies x."""
 
     boxes: FloatArray  # (N, 5) middle x, y [m], turn [rad], length, width [m]
     rooms: tuple[Room, ...]
+    corner: FloatArray  # (2,) the lower left one, inside [m]
     width_m: float
 
     def __post_init__(self) -> None:
         frozen(self, "boxes", np.float64, (None, 5))
+        frozen(self, "corner", np.float64, (2,))
 
     def mesh(self) -> Mesh:
         """Return all that stands on the floor, to the ceiling."""
@@ -82,7 +84,7 @@ class Office:
 
     def is_inside(self, points: FloatArray) -> BoolArray:
         """Return whether points (..., 2) [m] lie within the outer walls."""
-        x, y = points[..., 0], points[..., 1]
+        x, y = np.moveaxis(points - self.corner, -1, 0)
         inside: BoolArray = (x > 0) & (x < self.width_m) & (y > 0) & (y < DEPTH_M)
         return inside
 
@@ -91,10 +93,23 @@ def office(
     width_m: float, rng: np.random.Generator, *, has_rooms: bool = True, furnished: bool = True
 ) -> Office:
     """Return a floor with rooms on both sides and within the ring; without rooms the walls are smooth."""
-    rooms = tuple(_rooms(width_m, rng)) if has_rooms else ()
+    rooms = tuple(_rooms(width_m, rng)) if has_rooms else ()  # from the corner, for now
     walls = [*_outer_walls(width_m), *_corridor_walls(width_m, rooms), *_partitions(rooms)]
     things = [*_furniture(rooms, rng), *_cupboards(width_m, rooms, rng)] if furnished else []
-    return Office(boxes=np.array([*walls, *things]), rooms=rooms, width_m=width_m)
+    corner = np.array([-width_m / 2, -ROOM_M - CORRIDOR_M / 2])
+    boxes = np.array([*walls, *things])
+    boxes[:, :2] += corner
+    moved = tuple(_moved(room, *corner.tolist()) for room in rooms)
+    return Office(boxes=boxes, rooms=moved, corner=corner, width_m=width_m)
+
+
+def _moved(room: Room, x_m: float, y_m: float) -> Room:
+    return Room(
+        (room.x_m[0] + x_m, room.x_m[1] + x_m),
+        (room.y_m[0] + y_m, room.y_m[1] + y_m),
+        room.door_m + x_m,
+        room.door_side,
+    )
 
 
 def _rooms(width_m: float, rng: np.random.Generator) -> Iterator[Room]:

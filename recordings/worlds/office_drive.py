@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from mapstream.recordings.worlds.motion import Motion
-from mapstream.recordings.worlds.office import CORRIDOR_M, DEPTH_M, ROOM_M, Office, Room
+from mapstream.recordings.worlds.office import CORE_M, CORRIDOR_M, Office, Room
 from mapstream.recordings.worlds.sway import RAMP_S, REST_S, from_rest
 from mapstream.streams.arrays import FloatArray
 
@@ -62,9 +62,9 @@ def office_drive(floor: Office, route: Route, start_ns: int, rng: np.random.Gene
 
 def _stations(floor: Office, route: Route, rng: np.random.Generator) -> Iterator[_STATION]:
     """Yield where the way goes, in straight lines; the last lap may be a part of one."""
-    left, right = CORRIDOR_M / 2, floor.width_m - CORRIDOR_M / 2
-    south, north = ROOM_M + CORRIDOR_M / 2, DEPTH_M - ROOM_M - CORRIDOR_M / 2
-    middle = floor.width_m / 2
+    right = (floor.width_m - CORRIDOR_M) / 2
+    left, south, north = -right, 0.0, CORE_M + CORRIDOR_M
+    middle = 0.0
     length = 2 * (right - left + north - south)
     corners = ((right, south), (right, north), (left, north), (left, south), (middle, south))
     at, heading = (middle, south), 0.0

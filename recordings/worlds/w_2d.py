@@ -54,8 +54,8 @@ class W2dConfig(BaseModel):
 def w_2d(config: W2dConfig, seed: int) -> Simulation:
     """Return the recording of one drive; equal arguments give equal recordings.
 
-    Topics: `/scan`; `/odom`, of wheels that slip; `/truth`, the pose of the base in the building;
-    `/truth/plan`, the building.
+    Topics: `/scan`; `/odom`, of wheels that slip; `/truth`, the pose of the base in the building,
+    whose origin is where a drive starts that is not reversed; `/truth/plan`, the building.
     """
     drive_rng, laser_rng, wheels_rng = map(
         np.random.default_rng, np.random.SeedSequence(seed).spawn(3)
@@ -103,13 +103,15 @@ def plan_of(floor: Office) -> OccupancyGrid:
     columns, rows = (
         int(np.ceil((size + 2 * _MARGIN_M) / _PLAN_M)) for size in (floor.width_m, DEPTH_M)
     )
-    x = (np.arange(columns) + 0.5) * _PLAN_M - _MARGIN_M
-    y = (np.arange(rows) + 0.5) * _PLAN_M - _MARGIN_M
-    points = np.stack(np.meshgrid(x, y), axis=-1)
+    corner = floor.corner - _MARGIN_M
+    x, y = (np.arange(count) + 0.5 for count in (columns, rows))
+    points = np.stack(np.meshgrid(x, y), axis=-1) * _PLAN_M + corner
     cells = np.where(floor.is_inside(points), FREE, UNKNOWN)
     cells[floor.is_solid(points)] = OCCUPIED
-    corner = SE3.from_rotation(np.eye(3), [-_MARGIN_M, -_MARGIN_M, 0.0])
-    return OccupancyGrid(stamp_ns=START_NS, cells=cells, resolution_m=_PLAN_M, T_map_grid=corner)
+    T_world_grid = SE3.from_rotation(np.eye(3), [*corner, 0.0])
+    return OccupancyGrid(
+        stamp_ns=START_NS, cells=cells, resolution_m=_PLAN_M, T_map_grid=T_world_grid
+    )
 
 
 def _truth(motion: Motion) -> list[Odometry]:
