@@ -15,6 +15,7 @@ from mapstream.graph.cli.localize_graphs import (
     is_for_lidar,
     lidar_graph,
 )
+from mapstream.graph.cli.localize_laser import is_for_laser, laser_graph
 from mapstream.graph.cli.options import KeySetList
 from mapstream.graph.cli.output import JsonFlag, in_place, plain, say, say_json, say_table
 from mapstream.graph.cli.planning import Request, plan_request
@@ -22,13 +23,17 @@ from mapstream.graph.cli.run_report import print_report
 from mapstream.graph.cli.running import execute
 from mapstream.graph.trajectory_sources import TRUTH, read_trajectory
 from mapstream.recordings.localization import LocalizationScore, read_map_poses, score_poses
-from mapstream.recordings.recording import open_recording
+from mapstream.recordings.recording import Recording, open_recording
 from mapstream.streams.trajectory import Trajectory
 
 
 def localize(  # noqa: PLR0913  # one for each option of the command
     map_: Annotated[
-        Path, typer.Argument(metavar="MAP", help="The folder of a map or its summary.")
+        Path,
+        typer.Argument(
+            metavar="MAP",
+            help="The folder of a map or its summary, or an occupancy grid's YAML file.",
+        ),
     ],
     recording: Annotated[Path, typer.Argument(help="What the robot saw.")],
     *,
@@ -56,11 +61,7 @@ def localize(  # noqa: PLR0913  # one for each option of the command
 ) -> None:
     """Localise a recording in a map, and say how often and how well that worked."""
     with open_recording(recording) as opened:
-        text = (
-            lidar_graph(map_, opened, lidar, odometry)
-            if lidar is not None or (camera is None and is_for_lidar(map_, opened))
-            else camera_graph(map_, opened, camera, odometry)
-        )
+        text = _graph(map_, opened, camera, lidar, odometry)
         has_truth = TRUTH in opened.topics
     with tempfile.TemporaryDirectory() as folder:
         graph, poses_file = Path(folder) / "localize.yaml", out or Path(folder) / "poses.mcap"
@@ -79,6 +80,22 @@ def localize(  # noqa: PLR0913  # one for each option of the command
     else:
         _tell(score, in_place(out) if out is not None else None)
     raise typer.Exit(report.exit_code)
+
+
+def _graph(
+    map_: Path,
+    recording: Recording,
+    camera: list[str] | None,
+    lidar: str | None,
+    odometry: str | None,
+) -> str:
+    """Return the graph for what was asked for, else for what the map and the recording have in common."""
+    is_open = camera is None and lidar is None
+    if is_open and is_for_laser(map_, recording):
+        return laser_graph(map_, recording, odometry)
+    if lidar is not None or (is_open and is_for_lidar(map_, recording)):
+        return lidar_graph(map_, recording, lidar, odometry)
+    return camera_graph(map_, recording, camera, odometry)
 
 
 def _truth(path: Path | None) -> Trajectory | None:

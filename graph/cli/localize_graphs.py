@@ -40,8 +40,13 @@ _SINK = (
 
 def is_for_lidar(folder: Path, recording: Recording) -> bool:
     """Return whether a map has clouds and nothing that is detected in images, and a recording scans."""
+    return is_of_clouds(folder) and bool(topics_for(LidarScan, recording))
+
+
+def is_of_clouds(folder: Path) -> bool:
+    """Return whether a map has clouds and nothing that is detected in images."""
     has_clouds = "cloud" in load_map(folder, tables=["resources"]).resources.kind.tolist()
-    return has_clouds and not _kinds(folder)[0] and bool(topics_for(LidarScan, recording))
+    return has_clouds and not _kinds(folder)[0]
 
 
 def lidar_graph(folder: Path, recording: Recording, lidar: str | None, odometry: str | None) -> str:
