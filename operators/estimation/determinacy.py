@@ -18,6 +18,7 @@ from mapstream.operators.estimation.keys import variable_of
 from mapstream.operators.estimation.noise import Factor
 from mapstream.operators.estimation.problem import Problem, describe_variable, graph_of
 from mapstream.operators.estimation.vision.normal_equations import reduced_normal
+from mapstream.operators.odometry.uncertainty import is_whole
 from mapstream.streams.arrays import FloatArray, IntArray
 from mapstream.streams.errors import EstimationError
 
@@ -78,7 +79,7 @@ def _is_full(problem: Problem) -> bool:
     """Return whether all edges measure all six directions: then what is connected is determined."""
     edges = problem.map.edges
     rows = np.array([*problem.plain, *problem.loops], dtype=np.int64)
-    is_measured = np.isfinite(np.diagonal(edges.covariance[rows], axis1=1, axis2=2)).all()
+    is_measured = is_whole(edges.covariance[rows]).all()
     return bool(is_measured) and set(edges.kind[rows]) <= _FULL_KINDS
 
 

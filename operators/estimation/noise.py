@@ -7,17 +7,19 @@ from typing import Any
 import gtsam
 import numpy as np
 
+from mapstream.operators.odometry.uncertainty import OPEN_VARIANCE, is_whole
 from mapstream.streams.arrays import FloatArray
 from mapstream.streams.errors import EstimationError
 
 Factor = Any  # gtsam has no types
+_POSE = 6  # dimensions of one
 
 
 def noise_from_covariance(covariance: FloatArray, jacobian: FloatArray | None = None) -> Any:  # noqa: ANN401
     """Return the noise model of a covariance (N, N), of poses (6, 6) with rotation first [rad, m].
 
-    A direction with an infinite variance was not measured: its information is exactly zero, never a huge
-    sigma. `gtsam.noiseModel.Gaussian.Information` is silently wrong for singular matrices, hence the root.
+    A direction that was not measured, an axis of infinite variance or any direction of `OPEN_VARIANCE` or more
+    in a pose's, has no information at all, never that of a huge sigma. `gtsam.noiseModel.Gaussian.Information` is silently wrong for singular matrices, hence the root.
 
     Args:
         covariance: Of the measurement's error.
@@ -33,12 +35,17 @@ def noise_from_covariance(covariance: FloatArray, jacobian: FloatArray | None = 
     eigenvalues, vectors = np.linalg.eigh(measured)
     if measured.size and eigenvalues[0] <= 0:
         raise EstimationError(f"a covariance must be positive definite: {covariance.tolist()}")
-    if jacobian is None and np.array_equal(measured, np.diag(np.diagonal(measured))):
+    is_closed = eigenvalues < (OPEN_VARIANCE if len(covariance) == _POSE else np.inf)
+    if (
+        jacobian is None
+        and is_closed.all()
+        and np.array_equal(measured, np.diag(np.diagonal(measured)))
+    ):
         precisions = np.zeros(len(covariance))
         precisions[is_measured] = 1 / np.diagonal(measured)
         return gtsam.noiseModel.Diagonal.Precisions(precisions)
     root = np.zeros_like(covariance)
-    root[np.ix_(is_measured, is_measured)] = (vectors / np.sqrt(eigenvalues)).T
+    root[np.ix_(is_measured, is_measured)] = (vectors * is_closed / np.sqrt(eigenvalues)).T
     if jacobian is not None:
         root = root @ jacobian
     return gtsam.noiseModel.Gaussian.SqrtInformation(root, False)  # noqa: FBT003  # smart=False
@@ -75,6 +82,8 @@ class NoiseModels:
     def _make(self, keys: list[bytes], covariances: FloatArray) -> None:
         """Make the noise of covariances; those with a direction that was not measured are left out."""
         is_finite = np.asarray(np.isfinite(covariances).all(axis=(1, 2)))
+        if covariances.shape[-1] == _POSE:
+            is_finite &= is_whole(covariances)
         filled = np.where(is_finite[:, None, None], covariances, np.eye(covariances.shape[-1]))
         try:
             roots = np.linalg.inv(np.linalg.cholesky(filled))

@@ -18,7 +18,11 @@ from mapstream.streams.arrays import FloatArray
 from mapstream.streams.geometry import hat, symmetric
 from mapstream.streams.messages.estimates import UNOBSERVED_VARIANCE
 
+LEAST_SURPLUS = 3.0  # for normals of a map
 _NOISE_FLOOR_M = 0.01  # of a range; simulated surfaces fit better than any real one
+_IMPURE = (
+    0.25  # of a unit vector whose turns count at the mean range; a smaller part of it is noise
+)
 _CORRELATION = 25.0  # neighbouring points share their errors: this many count as one
 _NORMAL_ERROR_RAD = (
     0.05  # of an estimated normal: what it seems to see along its own surface is noise
@@ -41,7 +45,12 @@ class Observability:
 
 
 def observability_of_planes(
-    points: FloatArray, normals: FloatArray, rmse_m: float, weights: FloatArray | None = None
+    points: FloatArray,
+    normals: FloatArray,
+    rmse_m: float,
+    weights: FloatArray | None = None,
+    *,
+    least_surplus: float = LEAST_SURPLUS,
 ) -> Observability:
     """Return what the distances of points from planes observe of the pose.
 
@@ -50,6 +59,7 @@ def observability_of_planes(
         normals: (N, 3) of the planes they lie on, turned into the moving frame.
         rmse_m: Of the distances across the planes.
         weights: (N,) how much each point counts; left out, all count alike.
+        least_surplus: A direction that is observed shows so many times as much as noise of normals would, beyond it.
 
     Perturbation on the right: each row of the Jacobian is [p x n, n].
     """
@@ -62,13 +72,15 @@ def observability_of_planes(
     squares = jacobian.T @ jacobian
     noise = _seen_by_noise(points * root[:, None], root) * np.outer(scale, scale)
     surplus, axes = np.linalg.eigh(squares - noise)
-    is_open = surplus <= np.einsum("ik,ij,jk->k", axes, noise, axes)
-    unseen = axes.T[is_open] * scale
+    is_open = surplus <= least_surplus * np.einsum("ik,ij,jk->k", axes, noise, axes)
+    open_axes = _pure(axes.T[is_open])
+    unseen = open_axes * scale
     unseen /= np.linalg.norm(unseen, axis=1, keepdims=True)
     variances = variance / np.where(is_open, np.inf, surplus)
-    seen_part = (axes * ~is_open) @ axes.T
+    seen_part = np.eye(6) - open_axes.T @ open_axes
     units = np.outer(scale, scale)
-    covariance = (axes * variances) @ axes.T * units + UNOBSERVED_VARIANCE * unseen.T @ unseen
+    known = seen_part @ (axes * variances) @ axes.T @ seen_part
+    covariance = known * units + UNOBSERVED_VARIANCE * unseen.T @ unseen
     return Observability(
         information=symmetric(seen_part @ squares @ seen_part / variance / units),
         covariance=symmetric(covariance),
@@ -76,6 +88,14 @@ def observability_of_planes(
         unseen=unseen,
         seen_part=scale[:, None] * seen_part / scale,
     )
+
+
+def _pure(axes: FloatArray) -> FloatArray:
+    """Return orthonormal directions (K, 6) without the little of a turn that noise gives to shifts, and the reverse."""
+    parts = axes.reshape(-1, 2, 3)
+    share = np.linalg.norm(parts, axis=2, keepdims=True)
+    pure = np.where(share < _IMPURE, 0.0, parts).reshape(-1, 6)
+    return np.asarray(np.linalg.qr(pure.T)[0].T)
 
 
 def covariance_of_planes(points: FloatArray, normals: FloatArray, rmse_m: float) -> FloatArray:

@@ -6,7 +6,7 @@ LiDAR Odometry, RA-L 2022, section III-D.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
 import numpy as np
@@ -23,7 +23,11 @@ from mapstream.operators.odometry.local_map import LocalMap
 from mapstream.operators.odometry.resolution import Resolution
 from mapstream.operators.odometry.scan_matcher import ScanMatcher
 from mapstream.operators.odometry.scan_motion import Sweep, is_plausible
-from mapstream.operators.odometry.uncertainty import unmeasured
+from mapstream.operators.odometry.uncertainty import (
+    as_predicted_along,
+    open_directions,
+    unmeasured,
+)
 from mapstream.operators.operator import Operator, OperatorConfig, Placement, offload, warn
 from mapstream.streams.arrays import FloatArray
 from mapstream.streams.channel import Receiver, Sender
@@ -85,7 +89,9 @@ class GicpOdometry(Operator[Inputs, Outputs]):
     and, where an IMU is connected, turned by the gyroscope. A fit that is not believed is searched for from
     other headings at a coarse resolution. If that fails too the step is reported: `is_lost`, the predicted
     pose, the covariance of no measurement, and a warning with its stamp.
-    The covariance of a good step is that of the registration: its Hessian scaled by the residual.
+    The covariance of a good step is that of the registration: its Hessian scaled by the residual. A direction
+    that the surroundings do not hold, such as a blank corridor's axis, goes on as predicted and has
+    `UNOBSERVED_VARIANCE`, so that another sensor may take it.
     """
 
     placement: ClassVar[Placement] = "process"  # small_gicp holds the GIL
@@ -176,7 +182,9 @@ class GicpOdometry(Operator[Inputs, Outputs]):
             raise EstimationError(
                 f"a jump of {np.linalg.norm(moved.t):.2f} m and {angle_deg:.1f} deg"
             )
-        return result
+        unseen = open_directions(result.covariance)
+        T = as_predicted_along(unseen, T_last @ step, result.T_target_source)
+        return replace(result, T_target_source=T)
 
     def _finish(
         self,

@@ -20,7 +20,7 @@ from mapstream.streams.arrays import FloatArray
 from mapstream.streams.channel import Receiver, Sender
 from mapstream.streams.errors import EstimationError
 from mapstream.streams.geometry import SE3
-from mapstream.streams.messages.estimates import Odometry, PointCloud
+from mapstream.streams.messages.estimates import UNOBSERVED_VARIANCE, Odometry, PointCloud
 from mapstream.streams.messages.sensors import LidarScan
 
 _VOXEL_PER_RANGE = 0.1  # of the median range: a metre in a street
@@ -77,7 +77,8 @@ class KissOdometry(Operator[Inputs, Outputs]):
     A scan that cannot be registered (too few points, little overlap with the scans before, a jump) is
     reported: `is_lost`, the predicted pose, the covariance of no measurement, and a warning with its stamp.
     The covariance of a good step is constant, or grows with the adaptive threshold, by which KISS-ICP
-    measures how far its prediction is off.
+    measures how far its prediction is off. A direction that the scan's surfaces do not hold, such as a blank
+    corridor's axis, goes on as predicted and has `UNOBSERVED_VARIANCE`, so that another sensor may take it.
     In narrow places point-to-point ICP locks to the rings of the scan; `gicp_odometry` does not.
     """
 
@@ -116,7 +117,7 @@ class KissOdometry(Operator[Inputs, Outputs]):
         T_odom_base = SE3.identity()
         if self._tracker is not None:
             T_odom_base = self._T_base_first @ tracker.pose @ sweep.T_base_sensor.inverse()
-        covariance = self._covariance(tracker.threshold_m)
+        covariance = self._covariance(tracker, sweep.T_base_sensor)
         odometry = Odometry(
             stamp_ns=sweep.end_ns,
             T_odom_base=T_odom_base,
@@ -150,7 +151,9 @@ class KissOdometry(Operator[Inputs, Outputs]):
     def _limits(self) -> Limits:
         return Limits(**self._config.model_dump(include=set(Limits.__dataclass_fields__)))
 
-    def _covariance(self, threshold_m: float) -> FloatArray:
+    def _covariance(self, tracker: KissTracker, T_base_sensor: SE3) -> FloatArray:
         config = self._config
-        growth = max(1.0, threshold_m / 10 / config.sigma_translation_m)
-        return diagonal(growth * config.sigma_rotation_rad, growth * config.sigma_translation_m)
+        growth = max(1.0, tracker.threshold_m / 10 / config.sigma_translation_m)
+        known = diagonal(growth * config.sigma_rotation_rad, growth * config.sigma_translation_m)
+        unseen = tracker.unseen @ T_base_sensor.adjoint().T
+        return known + UNOBSERVED_VARIANCE * unseen.T @ unseen

@@ -8,8 +8,10 @@ import numpy as np
 from kiss_icp.config import KISSConfig
 from kiss_icp.kiss_icp import KissICP
 
+from mapstream.operators.lidar.scan_shape import open_directions_of_scan
 from mapstream.operators.odometry.recent_voxels import RecentVoxels
 from mapstream.operators.odometry.scan_motion import Sweep, is_plausible
+from mapstream.operators.odometry.uncertainty import as_predicted_along
 from mapstream.streams.arrays import FloatArray
 from mapstream.streams.errors import EstimationError
 from mapstream.streams.geometry import SE3
@@ -37,6 +39,7 @@ class KissTracker:
         self._recent = RecentVoxels(2 * config.mapping.voxel_size)
         self._num_lost = 0
         self.has_map = False
+        self.unseen: FloatArray = np.empty((0, 6))  # directions that the last scan left open
 
     @property
     def pose(self) -> SE3:
@@ -80,6 +83,8 @@ class KissTracker:
             max_correspondance_distance=3 * sigma,
             kernel=sigma,
         )
+        self.unseen = open_directions_of_scan(frame_downsample)
+        pose = as_predicted_along(self.unseen, SE3(predicted), SE3(pose)).matrix
         moved = SE3(pose) @ source
         if self.has_map:
             try:

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from pydantic import Field, PositiveFloat
 
+from mapstream.operators.odometry.uncertainty import chain
 from mapstream.operators.operator import Operator, OperatorConfig, report_loss, warn
 from mapstream.operators.submaps.overlap import Overlap
 from mapstream.operators.submaps.records import records_of
@@ -117,9 +118,8 @@ class Keyframes(Operator[Inputs, Outputs]):
         else:
             T_previous_now = self._previous.T_odom_base.inverse() @ odometry.T_odom_base
             step = odometry.covariance
-            carried = T_previous_now.inverse().adjoint()
-            self._covariance = carried @ self._covariance @ carried.T
-            self._covariance += self._default_covariance if step is None else step
+            step = self._default_covariance if step is None else step
+            self._covariance = chain(self._covariance, T_previous_now, step)
             self._was_lost |= odometry.is_lost
             covariance = self._covariance.copy()
         self._previous = odometry

@@ -8,6 +8,7 @@ from itertools import pairwise
 import numpy as np
 from pydantic import Field, PositiveFloat, PositiveInt
 
+from mapstream.operators.odometry.uncertainty import bridged
 from mapstream.operators.operator import Operator, OperatorConfig, warn
 from mapstream.recordings.maps.ids import mission_id
 from mapstream.streams.channel import Receiver, Sender
@@ -103,6 +104,6 @@ class SubmapBuilder(Operator[Inputs, Outputs]):
             mission_b=self._mission_id,
             stamp_b_ns=b.stamp_ns,
             T_a_b=a.odometry.T_odom_base.inverse() @ b.odometry.T_odom_base,
-            covariance=b.odometry.covariance,
+            covariance=bridged(b.odometry.covariance, (b.stamp_ns - a.stamp_ns) / 1e9),
             source="odometry",
         )

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from mapstream.operators.odometry.continuous import Motion
+from mapstream.operators.odometry.uncertainty import bridged, open_directions
 from mapstream.operators.trajectory.imu_source import ImuSource
 from mapstream.operators.trajectory.motion_models import MotionModel
 from mapstream.operators.trajectory.sources import PoseSource
@@ -17,6 +18,7 @@ from mapstream.streams.join import END
 from mapstream.streams.messages.estimates import RelativePose
 
 _BRIDGE = "bridge"
+_TAKEN = 0.5  # of a direction that another source does not see; the rest it measures
 _SAMPLES_SAY_IT = np.diag(np.full(6, np.inf))  # an edge of kind imu measures no transform
 
 
@@ -85,7 +87,12 @@ class Links:
             EstimationError: As `motions`.
         """
         motions = self.motions(start_ns, end_ns)
-        edges = [self._edge(*each, start_ns, end_ns) for each in motions]
+        edges = [
+            self._edge(
+                name, kind, _with_bridge(motion, motions, end_ns - start_ns), start_ns, end_ns
+            )
+            for name, kind, motion in motions
+        ]
         return edges, next((motion for *_, motion in motions if motion is not None), None)
 
     def _edge(
@@ -104,3 +111,24 @@ class Links:
 
     def _moving(self) -> list[PoseSource | ImuSource]:
         return [*self.sources.values(), *([self.imu] if self.imu is not None else [])]
+
+
+def _with_bridge(
+    motion: Motion | None, motions: Sequence[tuple[str, str, Motion | None]], duration_ns: int
+) -> Motion | None:
+    """Return a motion whose open directions are left to the other sources, or bridged where none takes them.
+
+    Those of infinite variance are open on purpose, and stay so.
+    """
+    if motion is None or not np.isfinite(np.diagonal(motion.covariance)).all():
+        return motion
+    left = open_directions(motion.covariance)
+    for _, _, other in motions:
+        if other is None:
+            return motion
+        if other is not motion and len(left):
+            unseen = np.linalg.norm(open_directions(other.covariance) @ left.T, axis=0)
+            left = left[unseen > _TAKEN]
+    if not len(left):
+        return motion
+    return replace(motion, covariance=bridged(motion.covariance, duration_ns / 1e9))
