@@ -59,6 +59,7 @@ BUILT_IN = {
     "laser_loops": "mapstream.operators.laser.laser_loops:LaserLoops",
     "laser_odometry": "mapstream.operators.laser.laser_odometry:LaserOdometry",
     "lidar_loops": "mapstream.operators.lidar.loops:LidarLoops",
+    "lidar_places": "mapstream.operators.lidar.places.lidar_places:LidarPlaces",
     "lidar_tracks": "mapstream.operators.lidar.images.lidar_tracks:LidarTracks",
     "localize": "mapstream.operators.places.localize:Localize",
     "localize_lidar": "mapstream.operators.lidar.places.localize_lidar:LocalizeLidar",

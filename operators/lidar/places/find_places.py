@@ -28,6 +28,7 @@ from mapstream.operators.lidar.places.place_matcher import (
     PlaceMatcher,
     PlaceMatchingConfig,
 )
+from mapstream.operators.lidar.registration import RegistrationResult
 from mapstream.recordings.maps.build import append_edges
 from mapstream.recordings.maps.model import Map
 from mapstream.recordings.maps.rows import concatenate
@@ -57,6 +58,12 @@ class FindPlacesConfig(PlaceMatchingConfig, AgreementConfig):
     """The same of the position."""
     max_cloud_bytes: PositiveInt = 128_000_000
     """Memory for clouds; all of them are on disk."""
+
+    def edge_covariance(self, result: RegistrationResult) -> FloatArray:
+        """Return the covariance (6, 6) of the loop that a registration becomes."""
+        floor = np.repeat([self.sigma_rotation_rad, self.sigma_translation_m], 3)
+        covariance: FloatArray = result.covariance + np.diag(floor**2)
+        return covariance
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -203,25 +210,25 @@ class _Search:
             return  # it is counted where it is added
         self.counts["unlike"] += not judged
         for each in judged:
-            self.places.append(self._told(vertex, each))
+            self.places.append(told_place(self._map, vertex, each))
             if each.verdict == ACCEPTED and each.result is not None:
-                floor = [self._config.sigma_rotation_rad] * 3
-                floor += [self._config.sigma_translation_m] * 3
-                covariance = each.result.covariance + np.diag(np.square(floor))
+                covariance = self._config.edge_covariance(each.result)
                 key, T_a_b = each.proposal.key, each.result.T_target_source
                 self.edges.append(loop_edge(key, vertex, T_a_b, covariance, SOURCE))
 
-    def _told(self, vertex: int, judged: Judged) -> LidarPlace:
-        vertices, place, result = self._map.vertices, judged.proposal.key, judged.result
-        T_map = self._map.T_map_base(np.array([place, vertex]))
-        return LidarPlace(
-            mission_a=self._map.mission_id(int(vertices.mission[place])),
-            stamp_a_ns=int(vertices.stamp_ns[place]),
-            mission_b=self._map.mission_id(int(vertices.mission[vertex])),
-            stamp_b_ns=int(vertices.stamp_ns[vertex]),
-            distance_m=float(np.linalg.norm(T_map[1, :3, 3] - T_map[0, :3, 3])),
-            num_inliers=judged.proposal.num_inliers,
-            inlier_fraction=float("nan") if result is None else result.inlier_fraction,
-            rmse_m=float("nan") if result is None else result.rmse_m,
-            verdict=judged.verdict,
-        )
+
+def told_place(map_: Map, vertex: int, judged: Judged) -> LidarPlace:
+    """Return what became of a place that a vertex was compared with, by missions and stamps."""
+    vertices, place, result = map_.vertices, judged.proposal.key, judged.result
+    T_map = map_.T_map_base(np.array([place, vertex]))
+    return LidarPlace(
+        mission_a=map_.mission_id(int(vertices.mission[place])),
+        stamp_a_ns=int(vertices.stamp_ns[place]),
+        mission_b=map_.mission_id(int(vertices.mission[vertex])),
+        stamp_b_ns=int(vertices.stamp_ns[vertex]),
+        distance_m=float(np.linalg.norm(T_map[1, :3, 3] - T_map[0, :3, 3])),
+        num_inliers=judged.proposal.num_inliers,
+        inlier_fraction=float("nan") if result is None else result.inlier_fraction,
+        rmse_m=float("nan") if result is None else result.rmse_m,
+        verdict=judged.verdict,
+    )

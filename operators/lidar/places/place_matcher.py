@@ -35,9 +35,9 @@ class PlaceMatchingConfig(AligningConfig):
     """The likeliest, that are registered."""
     shift_m: NonNegativeFloat = 0.0
     """How far beyond a proposal registration begins, too; 0: only there."""
-    min_inlier_fraction: PositiveFloat = 0.8
-    """Of the points, for a place to be believed."""
-    max_rmse_m: PositiveFloat = 0.06
+    min_inlier_fraction: PositiveFloat = 0.6
+    """Of the points, for a place to be believed; corridors of another building that are alike reach 0.47."""
+    max_rmse_m: PositiveFloat = 0.1
     """Of the inliers."""
     max_sigma_m: PositiveFloat = 0.3
     """How uncertain the position may be by the registration."""

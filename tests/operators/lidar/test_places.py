@@ -8,16 +8,21 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from mapstream.operators.backend.optimizer import Optimizer, OptimizerConfig
 from mapstream.operators.estimation.batch import optimize_map
 from mapstream.operators.lidar.places.birds_eye import levelling
 from mapstream.operators.lidar.places.find_places import SOURCE, FindPlacesConfig, find_places
+from mapstream.operators.lidar.places.lidar_places import LidarPlaces, LidarPlacesConfig
 from mapstream.operators.lidar.places.place_matcher import PlaceMatcher, PlaceMatchingConfig
 from mapstream.operators.lidar.places.planar_motion import planar_motion
 from mapstream.operators.lidar.places.recognizers import make_recognizer
+from mapstream.operators.testing import run_operator
 from mapstream.recordings.maps.check import check_map
 from mapstream.streams.errors import ConfigError, EstimationError
 from mapstream.streams.geometry import SE3
+from tests.data import shared
 from tests.operators.lidar.drives import (
+    MISSION,
     OTHER_MISSION,
     both,
     circle,
@@ -177,3 +182,61 @@ def test_I12_map_closures_recognises_the_hall() -> None:
 
     expected = somewhere(best.key - 100).inverse() @ T_query
     assert np.linalg.norm((expected.inverse() @ best.T_place_query).t) < 0.5
+
+
+@pytest.mark.anyio
+async def test_I12_live_missions_find_each_other_and_wait_for_agreement() -> None:
+    """Loops between missions come with the third that agrees; the second robot starts anywhere."""
+    there, back = circle(10)[:7], [T @ SE3.exp([0, 0, np.pi, 0, 0, 0]) for T in circle(10)[2:7]]
+    first = submap_of(there, SE3.identity(), world=HALL)
+    second = submap_of(back, SE3.identity(), world=HALL, mission=OTHER_MISSION, seed=60)
+    config = LidarPlacesConfig.model_validate(CONFIG.model_dump())
+
+    reports = (await run_operator(LidarPlaces(config), submaps=[first, second]))["loops"]
+
+    assert [report.stamp_ns for report in reports] == [first.stamp_ns, second.stamp_ns]
+    edges = reports[1].edges
+    assert len(edges) >= 3
+    for edge in edges:
+        assert (edge.mission_a, edge.mission_b) == (MISSION, OTHER_MISSION)
+        T_a_b = there[edge.stamp_a_ns // 10**9].inverse() @ back[edge.stamp_b_ns // 10**9]
+        assert np.linalg.norm((T_a_b.inverse() @ edge.T_a_b).t) < 0.03
+        assert edge.is_switchable
+    assert len({(edge.stamp_a_ns, edge.stamp_b_ns) for edge in edges}) == len(edges)
+    maps = (
+        await run_operator(Optimizer(OptimizerConfig()), submaps=[first, second], loops=reports)
+    )["maps"]
+    T_map_first, T_map_second = (
+        SE3(maps[-1].T_map_base(maps[-1].vertices_of(mission)[:1])[0]) for mission in (0, 1)
+    )
+    assert (
+        np.linalg.norm((there[0].inverse() @ back[0]).t - (T_map_first.inverse() @ T_map_second).t)
+        < 0.03
+    )
+
+
+def test_I12_real_submaps_are_recognised_and_registered() -> None:
+    """Five submaps of KITTI 07, each turned and moved at will: all are found, within 3 cm of the reference."""
+    folder = shared("kitti07_submaps")
+    lines = [line.split() for line in (folder / "graph.txt").read_text().splitlines()]
+    rows = [np.array(line[1:], float) for line in lines if line and line[0].startswith("v")]
+    poses = [SE3.from_quat_xyzw(row[3:], row[:3]) for row in rows]
+    clouds = [
+        np.fromfile(folder / f"{k:06d}" / "points.bin", np.float32).reshape(-1, 3).astype(float)
+        for k in range(5)
+    ]
+    carried = SE3.exp([0, 0, 2.0, 5.0, -3.0, 0])
+    config = PlaceMatchingConfig(
+        voxel_size_m=0.5, search_distances_m=(2.0, 0.8), inlier_distance_m=0.2
+    )
+    for query in range(5):
+        matcher = PlaceMatcher(config, lambda key: clouds[key])
+        for key in (k for k in range(5) if k != query):
+            matcher.add(key)
+
+        found = matcher.recognize(carried.inverse() @ clouds[query])[-1]
+
+        assert found.verdict == "accepted"
+        assert found.result is not None
+        expected = poses[found.proposal.key].inverse() @ poses[query] @ carried
+        assert np.linalg.norm((expected.inverse() @ found.result.T_target_source).t) < 0.03
