@@ -41,6 +41,7 @@ _KNOWN = (
     vision.ImageFeatures,
     vision.NFrame,
 )
+POINTS = "points"  # below the path of keypoints: where they are in space
 CLOSED = (rrb.BlueprintPanel(state="collapsed"), rrb.SelectionPanel(state="collapsed"))
 _HIDDEN = rrb.EntityBehavior(visible=False)
 
@@ -52,8 +53,9 @@ def blueprint_of(plan: Plan, outputs: Sequence[Output]) -> rrb.Blueprint:
     operators = rrb.GraphView(origin=GRAPH, name="Operators", visual_bounds=bounds)
     space = [output for output in outputs if output.sends(*_IN_SPACE)]
     cameras = _cameras(plan, outputs)
+    features = [output.path for output in outputs if output.sends(vision.ImageFeatures)]
     large = (
-        [map_view(space)] if space else cameras
+        [map_view(space, features=features)] if space else cameras
     )  # without a map the images are what there is to see
     main = rrb.Vertical(_tabs(large), operators, row_shares=[3, 1]) if large else operators
     side = [cameras if space else [], _plots(outputs), _texts(outputs)]
@@ -73,8 +75,12 @@ def map_view(
     outputs: Sequence[Output] = (),
     eye: rrb.EyeControls3D | None = None,
     hidden_paths: Sequence[str] = (),
+    features: Sequence[str] = (),
 ) -> rrb.Spatial3DView:
-    """Return the view of all that has a place, seen from the map's frame; some is drawn once it is ticked."""
+    """Return the view of all that has a place, seen from the map's frame; some is drawn once it is ticked.
+
+    Of outputs with keypoints, named by their paths, the 3D points are shown.
+    """
     has_clouds = any(output.sends(estimates.PointCloud) for output in outputs)
     hidden = [o.path for o in outputs if o.sends(estimates.Keyframe)]
     hidden += [o.path for o in outputs if has_clouds and o.sends(sensors.LidarScan)]
@@ -82,7 +88,11 @@ def map_view(
     return rrb.Spatial3DView(
         name="Map",
         origin="/",
-        contents=["+ /map/**", *(f"+ /{output.path}/**" for output in outputs)],
+        contents=[
+            "+ /map/**",
+            *(f"+ /{output.path}/**" for output in outputs),
+            *(f"+ /{path}/{POINTS}" for path in features),
+        ],
         overrides=dict.fromkeys((*hidden_paths, *(f"/{path}" for path in hidden)), _HIDDEN),
         eye_controls=eye,
         background=rrb.Background(color=0x0B0E14FF),
@@ -98,6 +108,7 @@ def _cameras(plan: Plan, outputs: Sequence[Output]) -> list[rrb.View]:
         made_of_it = _made_of(plan, (picture.edge.from_node, picture.edge.from_port))
         found = [f for f in features if (f.edge.from_node, f.edge.from_port) in made_of_it]
         contents = [f"+ /{output.path}/**" for output in (picture, *found)]
+        contents += [f"- /{output.path}/{POINTS}" for output in found]
         views.append(rrb.Spatial2DView(name=picture.path, origin="/", contents=contents))
     return views
 

@@ -9,7 +9,7 @@ import numpy as np
 import rerun as rr
 
 from mapstream.graph.views.colors import KEYPOINT, REFUSED, ramp_colors
-from mapstream.graph.views.scene import Drawing, Entry, Scene
+from mapstream.graph.views.scene import Drawing, Entry, Scene, sensor_frame
 from mapstream.operators.features.rows import rows_of
 from mapstream.streams.arrays import Float32Array, IntArray
 from mapstream.streams.messages.vision import NO_TRACK, ImageFeatures, NFrame
@@ -44,9 +44,10 @@ def view_image_features(features: ImageFeatures, scene: Scene) -> Drawing:
     """Draw keypoints over their image; those with tracks with tails, coloured by how long they were followed.
 
     Grey lines lead to where another camera sees the same point; what ended in this image is red.
+    Those with 3D points are drawn there, too.
     """
     if features.track_ids is None:
-        return [Entry.of("", _keypoints(features))]
+        return [Entry.of("", _keypoints(features)), *_in_space(features, KEYPOINT, scene)]
     has_track = features.track_ids != NO_TRACK
     loose = rows_of(features, ~has_track)
     ids, px = features.track_ids[has_track], features.keypoints_px[has_track]
@@ -56,7 +57,10 @@ def view_image_features(features: ImageFeatures, scene: Scene) -> Drawing:
     colors: Any = ramp_colors(lengths, _SHORT, _LONG)
     strips = [np.array(trails.tails[track], np.float32) for track in ids.tolist()]
     matches = _matches(features, ids, px, scene)
+    all_colors = np.full(len(features), KEYPOINT, np.uint32)
+    all_colors[has_track] = colors
     return [
+        *_in_space(features, all_colors, scene),
         Entry.of("", _keypoints(loose)),
         Entry.of("tracks", rr.Points2D(px, colors=colors, radii=_ui(2.5), draw_order=_ABOVE + 3)),
         Entry.of(
@@ -93,6 +97,15 @@ def _keypoints(features: ImageFeatures) -> rr.Points2D:
     if scales is not None and len(scales):
         radii = np.clip(scales / 8, 1.5, 12)  # the true diameter would hide the picture
     return rr.Points2D(features.keypoints_px, colors=colors, radii=radii, draw_order=_ABOVE)
+
+
+def _in_space(features: ImageFeatures, colors: Any, scene: Scene) -> list[Entry]:  # noqa: ANN401  # one, or (N,)
+    """Return the 3D points of keypoints, where the sensor sits."""
+    if features.points_m is None:
+        return []
+    mount = scene.mount(features.frame, features.T_base_sensor)
+    points = rr.Points3D(features.points_m, colors=colors, radii=_ui(3.0))
+    return [*mount, *scene.within("points", sensor_frame(features.frame), points)]
 
 
 def _matches(

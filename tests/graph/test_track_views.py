@@ -13,9 +13,13 @@ import rerun.blueprint as rrb
 from mapstream.graph.blueprint import blueprint_of
 from mapstream.graph.tap_outputs import drawn_outputs
 from mapstream.graph.views.colors import ramp_colors
+from mapstream.operators.lidar.images.lidar_image import LidarImage
+from mapstream.operators.lidar.images.lidar_keypoints import LidarKeypoints
+from mapstream.operators.lidar.images.lidar_tracks import LidarTracks
 from mapstream.operators.sources.mcap import McapSource
 from mapstream.operators.tracking.klt import Klt
 from mapstream.operators.tracking.n_frames import NFrames
+from mapstream.streams.geometry import SE3
 from mapstream.streams.messages.vision import NO_TRACK, ImageFeatures, NFrame
 from tests.graph.made_plans import make_plan, node
 from tests.graph.rrd import values_of
@@ -98,9 +102,37 @@ def test_P4_each_image_of_a_pair_shows_its_own_keypoints() -> None:
     assert [view.name for view in views][:3] == ["cameras/left", "cameras/right", "Operators"]
     contents = {view.name: view.contents for view in views if "cameras" in str(view.name)}
     assert contents == {
-        "cameras/left": ["+ /cameras/left/**", "+ /klt/features/**"],
-        "cameras/right": ["+ /cameras/right/**", "+ /klt/right_features/**"],
+        f"cameras/{side}": [
+            f"+ /cameras/{side}/**",
+            f"+ /klt/{features}/**",
+            f"- /klt/{features}/points",  # those lie in space
+        ]
+        for side, features in (("left", "features"), ("right", "right_features"))
     }
+
+
+def test_D17_keypoints_of_a_lidar_lie_over_its_image_and_in_space(tmp_path: Path) -> None:
+    points = np.array([[1, 2, 3], [4, 5, 6], [7, 8, 9], [np.nan] * 3], np.float32)
+    mounted = SE3.exp([0, 0, 0, 1, 0, 0])
+    lidar = replace(_FIRST, frame="os", points_m=points, T_base_sensor=mounted)
+    sensors = node(
+        McapSource, path="x.mcap", topics={"scans": {"topic": "/s", "type": "LidarScan"}}
+    )
+    plan = make_plan(
+        {"sensors": sensors, "image": node(LidarImage), "found": node(LidarKeypoints), "tracks": node(LidarTracks)},
+        "sensors.scans -> image.scans",
+        "sensors.scans -> found.scans",
+        "image.frames -> found.frames",
+        "found.features -> tracks.features",
+    )  # fmt: skip
+
+    entities = drawn(tmp_path, [lidar, replace(lidar, stamp_ns=2 * 10**9, track_ids=None)])
+    views = {str(v.name): v for v in _views(blueprint_of(plan, drawn_outputs(plan)).root_container)}
+
+    seen = values_of(entities["/op/port/points"], "Points3D:positions")
+    np.testing.assert_array_equal(seen, [points.tolist()] * 2)
+    assert "+ /found/features/**" in views["image/frames"].contents
+    assert "+ /found/features/points" in views["Map"].contents
 
 
 def _views(container: rrb.Container) -> Iterator[Any]:

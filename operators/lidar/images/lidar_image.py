@@ -27,7 +27,7 @@ class Inputs:
 
 @dataclass(frozen=True)
 class Outputs:
-    """One image for each scan, at the scan's end."""
+    """One image for each scan, with its stamp."""
 
     frames: Sender[CameraFrame]
 
@@ -61,7 +61,7 @@ class LidarImage(Operator[Inputs, Outputs]):
         """Return the image of a projected scan."""
         scan = projected.scan
         return CameraFrame(
-            stamp_ns=scan.end_ns,
+            stamp_ns=scan.stamp_ns,
             image=self._painter.paint(projected),
             encoding="mono8",
             frame=scan.frame,

@@ -16,8 +16,10 @@ from mapstream.operators.lidar.images.lidar_image import LidarImage, LidarImageC
 from mapstream.operators.operator import Operator, Placement, offload, warn
 from mapstream.streams.arrays import BoolArray, IntArray
 from mapstream.streams.channel import Receiver, Sender
-from mapstream.streams.messages.sensors import LidarScan
+from mapstream.streams.errors import OperatorError
+from mapstream.streams.messages.sensors import CameraFrame, LidarScan
 from mapstream.streams.messages.vision import ImageFeatures
+from mapstream.streams.sync import exact
 
 _AROUND = np.indices((3, 3)).reshape(2, -1) - 1  # rows and columns from a pixel to those around it
 
@@ -36,9 +38,10 @@ class LidarKeypointsConfig(FinderConfig):
 
 @dataclass(frozen=True)
 class Inputs:
-    """Scans of one LiDAR."""
+    """Scans of one LiDAR; and their images, where another operator paints or changes them."""
 
     scans: Receiver[LidarScan]
+    frames: Receiver[CameraFrame] | None = None
 
 
 @dataclass(frozen=True)
@@ -52,6 +55,7 @@ class LidarKeypoints(Operator[Inputs, Outputs]):
     """Find keypoints in the image of each scan: each with its 3D point, and its time within the sweep.
 
     A keypoint is where the scan has a point, never where the image is painted over.
+    Images may come from `lidar_image`, of the same options, or from what follows it; without, they are painted here.
     """
 
     placement: ClassVar[Placement] = "thread"
@@ -63,16 +67,43 @@ class LidarKeypoints(Operator[Inputs, Outputs]):
 
     async def run(self, inputs: Inputs, outputs: Outputs) -> None:
         cv2.setNumThreads(1)  # operators run beside each other
-        async for scan in inputs.scans:
-            features = await offload(self.detect, scan)
-            if not len(features):
-                warn(f"scans of {scan.frame} without a keypoint")
-            await outputs.features.send(features)
+        if inputs.frames is None:
+            async for scan in inputs.scans:
+                await self._send(outputs, await offload(self.detect, scan))
+            return
+        pairs = exact(inputs.scans, inputs.frames)
+        async for scan, frame in pairs:
+            await self._send(outputs, await offload(self.detect, scan, frame))
+        if pairs.stats.unmatched:
+            warn(pairs.explain())
 
-    def detect(self, scan: LidarScan) -> ImageFeatures:
-        """Return the keypoints of the next scan, the strongest first; times count from the scan's end."""
+    async def _send(self, outputs: Outputs, features: ImageFeatures) -> None:
+        if not len(features):
+            warn(f"scans of {features.frame} without a keypoint")
+        await outputs.features.send(features)
+
+    def detect(self, scan: LidarScan, frame: CameraFrame | None = None) -> ImageFeatures:
+        """Return the keypoints of the next scan, the strongest first; times count from the scan's end.
+
+        Args:
+            scan: The scan.
+            frame: Its image; painted here without.
+
+        Raises:
+            OperatorError: If the image is not of the size that this operator would paint.
+        """
         projected = self._image.project(scan)
-        found = self._finder.find(self._image.painted(projected))
+        frame = frame or self._image.painted(projected)
+        if frame.image.shape != projected.point.shape:
+            raise OperatorError(
+                f"{frame.frame}: the image has {frame.image.shape} pixels, its scan {projected.point.shape}; "
+                "give lidar_keypoints the `rows` and `columns` of lidar_image, under `image`"
+            )
+        return self._located(self._finder.find(frame), projected)
+
+    def _located(self, found: ImageFeatures, projected: ProjectedScan) -> ImageFeatures:
+        """Return the keypoints that are on points of the scan, with these and their times."""
+        scan = projected.scan
         column_row = np.rint(found.keypoints_px).astype(np.int64)
         column, row = column_row[:, 0] % projected.point.shape[1], column_row[:, 1]
         kept = np.flatnonzero(self._is_smooth(projected, column, row))
@@ -83,6 +114,7 @@ class LidarKeypoints(Operator[Inputs, Outputs]):
             offsets_ns = scan.offsets_ns - (scan.end_ns - scan.stamp_ns)
         return replace(
             rows_of(found, kept),
+            stamp_ns=scan.end_ns,
             points_m=scan.points[point],
             point_sigmas_m=np.hypot(self._config.sigma_m, range_m * projected.pixel_rad / 2),
             offsets_ns=offsets_ns[point],

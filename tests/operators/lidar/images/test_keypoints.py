@@ -11,7 +11,7 @@ from mapstream.operators.features.rows import rows_of
 from mapstream.operators.landmarks.create import create_landmarks
 from mapstream.operators.landmarks.views import views_of
 from mapstream.operators.lidar.images.grid import GridConfig, ScanGrid
-from mapstream.operators.lidar.images.lidar_image import LidarImageConfig
+from mapstream.operators.lidar.images.lidar_image import LidarImage, LidarImageConfig
 from mapstream.operators.lidar.images.lidar_keypoints import LidarKeypoints, LidarKeypointsConfig
 from mapstream.operators.lidar.images.lidar_tracks import LidarTracks, LidarTracksConfig
 from mapstream.operators.operator import Context, set_context
@@ -250,6 +250,27 @@ async def test_D17_tracks_need_the_odometry_of_their_stamp(drive: Drive) -> None
     assert [each.stamp_ns for each in sent["features"]] == [scan.end_ns for scan in scans]
     assert shared_tracks(sent["features"][1], sent["features"][2]) > 10
     assert any("without odometry within 1 ms" in text for text in context.activity.warnings)
+
+
+@pytest.mark.anyio
+async def test_images_may_be_painted_by_another_operator(drive: Drive) -> None:
+    scans = drive.scans[:2]
+    frames = (await run_operator(LidarImage(LidarImageConfig()), scans=scans))["frames"]
+
+    sent = await run_operator(keypoints("orb"), scans=scans, frames=frames)
+
+    alone = keypoints("orb")
+    for features, scan in zip(sent["features"], scans, strict=True):
+        expected = alone.detect(scan)
+        assert features.stamp_ns == expected.stamp_ns == scan.end_ns
+        np.testing.assert_array_equal(features.points_m, expected.points_m)
+
+
+def test_an_image_of_another_size_is_refused(drive: Drive) -> None:
+    frame = LidarImage(LidarImageConfig(columns=512)).image(drive.scans[0])
+
+    with pytest.raises(OperatorError, match="give lidar_keypoints the `rows` and `columns`"):
+        keypoints("orb").detect(drive.scans[0], frame)
 
 
 def test_keypoints_without_points_are_refused() -> None:
