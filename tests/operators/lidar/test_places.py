@@ -1,6 +1,7 @@
 """Places of a LiDAR: recognised from anywhere, never in another building, and missions that find each other."""
 
 import importlib.util
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,7 @@ from hypothesis import strategies as st
 
 from mapstream.operators.backend.optimizer import Optimizer, OptimizerConfig
 from mapstream.operators.estimation.batch import optimize_map
+from mapstream.operators.landmarks.create import create_landmarks
 from mapstream.operators.lidar.places.birds_eye import levelling
 from mapstream.operators.lidar.places.find_places import SOURCE, FindPlacesConfig, find_places
 from mapstream.operators.lidar.places.lidar_places import LidarPlaces, LidarPlacesConfig
@@ -20,6 +22,7 @@ from mapstream.operators.testing import run_operator
 from mapstream.recordings.maps.check import check_map
 from mapstream.streams.errors import ConfigError, EstimationError
 from mapstream.streams.geometry import SE3
+from mapstream.streams.messages.estimates import PointCloud
 from tests.data import shared
 from tests.operators.lidar.drives import (
     MISSION,
@@ -31,6 +34,7 @@ from tests.operators.lidar.drives import (
     submap_of,
     worst_edge_m,
 )
+from tests.operators.places import made_maps, scenes
 from tests.operators.scenes import room, seen_from
 
 HALL = room(5, num_points=14_000, boxes=16)
@@ -240,3 +244,36 @@ def test_I12_real_submaps_are_recognised_and_registered() -> None:
         assert found.result is not None
         expected = poses[found.proposal.key].inverse() @ poses[query] @ carried
         assert np.linalg.norm((expected.inverse() @ found.result.T_target_source).t) < 0.03
+
+
+def test_U5_a_lidar_closes_loops_in_a_map_that_cameras_made(tmp_path: Path) -> None:
+    """A camera's mission whose keyframes have clouds; a robot with a LiDAR alone is anchored in it."""
+    there = made_maps.circle(7)
+    seen = made_maps.flight(
+        made_maps.room(0, 200), MISSION, there, {"camera": scenes.camera()}, drift=0
+    )
+    keyframes = [
+        replace(
+            frame,
+            cloud=PointCloud(
+                stamp_ns=frame.stamp_ns, points=seen_from(HALL, T, k).astype(np.float32)
+            ),
+        )
+        for k, (frame, T) in enumerate(zip(seen.keyframes, there, strict=True))
+    ]
+    first, _ = create_landmarks(stored(replace(seen, keyframes=tuple(keyframes)), tmp_path))
+    back = [T @ SE3.exp([0, 0, np.pi, 0, 0, 0]) for T in made_maps.circle(7)[::-1][:5]]
+    second = stored(submap_of(back, world=HALL, mission=OTHER_MISSION, seed=70), tmp_path)
+
+    found, report = find_places(both(first, second), CONFIG, tmp_path)
+
+    assert len(found.landmarks) == len(first.landmarks) > 0
+    assert report.num_between >= 3
+    assert found.missions.is_base_frame_known.all()
+    assert check_map(found) == []
+    for row in np.flatnonzero(found.edges.source == SOURCE).tolist():
+        a, b = found.edges.vertex_a[row], found.edges.vertex_b[row]
+        period_ns = made_maps.PERIOD_NS
+        T_a = there[round((found.vertices.stamp_ns[a] - keyframes[0].stamp_ns) / period_ns)]
+        T_a_b = T_a.inverse() @ back[int(found.vertices.stamp_ns[b]) // 10**9]
+        assert np.linalg.norm((T_a_b.inverse() @ found.edges.T_a_b_of(row)).t) < 0.03
