@@ -27,9 +27,10 @@ from mapstream.streams.arrays import BoolArray, Float32Array, FloatArray, IntArr
 from mapstream.streams.errors import MapError
 from mapstream.streams.messages.estimates import PointCloud
 
-_RING = [(de, da) for de in (-1, 0, 1) for da in (-1, 0, 1)]  # cells around a direction
-_MIN_KNOWN = 3  # of these nine, for a look through them to count
+_AROUND = ((0, 0), (-1, 0), (1, 0), (0, -1), (0, 1))  # a direction's cell, and those beside it
+_MIN_KNOWN = 3  # of these five, for a look through them to count
 _NEIGHBOURS = 12  # points around one that are asked whether they moved
+_AGREEING = 0.3  # of these: looking through is rarely wrong, but edges and feet hide it
 _MAX_IMAGES = 256  # in memory
 
 
@@ -38,7 +39,7 @@ class MovingConfig(OperatorConfig):
 
     cell_deg: float = Field(default=1.0, gt=0.05, le=10.0)
     """Of the images of ranges; not finer than neighbouring beams."""
-    margin_m: PositiveFloat = 0.15
+    margin_m: PositiveFloat = 0.1
     """So much farther away must be what is seen through a point."""
     margin_share: float = Field(default=0.02, ge=0.0, le=0.5)
     """The same, as a part of the distance."""
@@ -48,7 +49,7 @@ class MovingConfig(OperatorConfig):
     """Farther points are not judged."""
     min_votes: PositiveInt = 2
     """So many must have looked through a place."""
-    share: float = Field(default=0.6, gt=0.0, le=1.0)
+    share: float = Field(default=0.5, gt=0.0, le=1.0)
     """Of all that saw the place, so many must have looked through it."""
 
 
@@ -123,8 +124,7 @@ class _Scene:
         view, config = self._view(number), self._config
         away_m = np.linalg.norm(view.points - view.origin, axis=1)
         is_moving = np.zeros(len(view.points), np.bool_)
-        later = self._begin_ns >= self._begin_ns[number]
-        for mission in np.unique(self._missions[later]).tolist():
+        for mission in self._judges(number):
             others = np.flatnonzero(self._missions == mission)
             others = others[others != number]
             apart_m = np.linalg.norm(self._middles[others] - self._middles[number], axis=1)
@@ -139,6 +139,14 @@ class _Scene:
             )
         is_moving &= away_m <= config.max_range_m
         return _agreed(view.points, is_moving)
+
+    def _judges(self, number: int) -> list[int]:
+        """Return the missions that say what is still there: its own, and later ones in the same frame."""
+        own, is_known = self._missions[number], self._map.missions.is_base_frame_known
+        is_later = (self._begin_ns > self._begin_ns[number]) & is_known[self._missions]
+        is_judge = (self._missions == own) | (is_later & is_known[own])
+        judges: list[int] = np.unique(self._missions[is_judge]).tolist()
+        return judges
 
     def _view(self, number: int) -> _View:
         row = self._rows[number]
@@ -165,7 +173,7 @@ class _Scene:
         height, width = nearest_m.shape
         num_known, is_near = np.zeros(len(points), np.int64), np.zeros(len(points), np.bool_)
         is_seen = np.zeros(len(points), np.bool_)
-        for de, da in _RING:
+        for de, da in _AROUND:
             around_m = nearest_m[np.clip(elevation + de, 0, height - 1), (azimuth + da) % width]
             num_known += np.isfinite(around_m)
             is_near |= around_m <= range_m + margin_m
@@ -187,13 +195,13 @@ class _Scene:
 
 
 def _agreed(points: FloatArray, is_moving: BoolArray) -> BoolArray:
-    """Return what most points around each say: a foot goes with its leg, and a lone edge of a table stays."""
+    """Return what the points around each say: a foot goes with its leg, and a lone edge of a table stays."""
     if not is_moving.any() or len(points) <= _NEIGHBOURS:
         return is_moving
     from scipy.spatial import cKDTree  # noqa: PLC0415  # scipy takes its time
 
     near = cKDTree(points).query(points, _NEIGHBOURS)[1]
-    agreed: BoolArray = is_moving[near].mean(axis=1) > 0.5
+    agreed: BoolArray = is_moving[near].mean(axis=1) > _AGREEING
     return agreed
 
 

@@ -16,6 +16,7 @@ from mapstream.graph.cli.map.history import journal, redo, undo
 from mapstream.graph.cli.map.landmarks import add_verbs, optimize_visual
 from mapstream.graph.cli.map.look import check, cloud_quality, picture, stats, view
 from mapstream.graph.cli.map.loops import close_loops, fix_stationary, loops
+from mapstream.graph.cli.map.moving import remove_moving_
 from mapstream.graph.cli.map.parts import merge, remove
 from mapstream.graph.cli.map.places import summarize
 from mapstream.graph.cli.map.registration import find_places, register
@@ -43,6 +44,7 @@ app.command("undo")(undo)
 app.command("redo")(redo)
 app.command("import")(import_)
 app.command("export")(export_)
+app.command("remove-moving")(remove_moving_)
 app.command("tiles")(tiles)
 app.command("elevation")(elevation_)
 app.command("elevation_mapping", hidden=True)(elevation_)
