@@ -60,17 +60,19 @@ class Office:
         frozen(self, "corner", np.float64, (2,))
 
     def mesh(self) -> Mesh:
-        """Return all that stands on the floor, to the ceiling."""
-        return join(
-            [
-                box(
-                    SE3.from_rotation(so3_exp([0, 0, turn]), [x, y, _HEIGHT_M / 2]),
-                    [length, width, _HEIGHT_M],
-                    0.5,
-                )
-                for x, y, turn, length, width in self.boxes
-            ]
-        )
+        """Return the ground, and all that stands on it, to the ceiling."""
+        size = [self.width_m + 2 * _OUTER_M, DEPTH_M + 2 * _OUTER_M, 0.1]
+        middle = self.corner + np.array([self.width_m, DEPTH_M]) / 2
+        ground = box(SE3.from_rotation(np.eye(3), [*middle, -0.05]), size, 0.3)
+        things = [
+            box(
+                SE3.from_rotation(so3_exp([0, 0, turn]), [x, y, _HEIGHT_M / 2]),
+                [length, width, _HEIGHT_M],
+                0.5,
+            )
+            for x, y, turn, length, width in self.boxes
+        ]
+        return join([ground, *things])
 
     def is_solid(self, points: FloatArray) -> BoolArray:
         """Return whether points (..., 2) [m] lie within a wall or a thing."""

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from heapq import merge
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, NonNegativeFloat, PositiveFloat
 
+from mapstream.recordings.worlds.depth_camera import DepthCamera, DepthCameraConfig
 from mapstream.recordings.worlds.motion import Motion
 from mapstream.recordings.worlds.office import DEPTH_M, MIN_WIDTH_M, Office, office
 from mapstream.recordings.worlds.office_drive import Route, office_drive
@@ -18,10 +20,16 @@ from mapstream.recordings.worlds.truth import stamps_at
 from mapstream.streams.geometry import SE3, so3_exp
 from mapstream.streams.messages.estimates import Odometry
 from mapstream.streams.messages.grids import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
+from mapstream.streams.messages.sensors import CameraFrame
 
 START_NS = 1_700_000_000 * 10**9
 # Turned and beside the middle, so that a forgotten extrinsic shows.
 T_BASE_LASER = SE3.from_rotation(so3_exp([0.0, 0.0, 0.15]), [0.18, 0.04, 0.25])
+DEPTH = "depth"
+# The camera's z is the base's x, a little downwards.
+T_BASE_DEPTH = SE3.from_rotation(
+    np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]]) @ so3_exp([-0.2, 0.0, 0.0]), [0.15, -0.06, 0.9]
+)
 _TRUTH_HZ = 50.0
 _PLAN_M = 0.05  # side of the plan's cells
 _MARGIN_M = 0.5  # of the plan, beyond the inner side of the outer walls
@@ -44,6 +52,8 @@ class W2dConfig(BaseModel):
     """By about how much wheels count wrong, as a part of the way; aside it is twice that."""
     wheels_hz: PositiveFloat = 50.0
     laser: PlanarLaserConfig = PlanarLaserConfig()
+    depth: DepthCameraConfig | None = None
+    """A depth camera that looks ahead, from the height of a table; none without."""
     furnished: bool = True
     blank_walls: bool = False
     """Corridors without doors, rooms and furniture, that say nothing of the motion along them."""
@@ -54,11 +64,11 @@ class W2dConfig(BaseModel):
 def w_2d(config: W2dConfig, seed: int) -> Simulation:
     """Return the recording of one drive; equal arguments give equal recordings.
 
-    Topics: `/scan`; `/odom`, of wheels that slip; `/truth`, the pose of the base in the building,
+    Topics: `/scan`; `/odom`, of wheels that slip; `/depth/image`, if asked for; `/truth`, the pose of the base in the building,
     whose origin is where a drive starts that is not reversed; `/truth/plan`, the building.
     """
-    drive_rng, laser_rng, wheels_rng = map(
-        np.random.default_rng, np.random.SeedSequence(seed).spawn(3)
+    drive_rng, laser_rng, wheels_rng, depth_rng = map(
+        np.random.default_rng, np.random.SeedSequence(seed).spawn(4)
     )
     floor = w_2d_floor(config, seed)
     route = Route(
@@ -74,6 +84,7 @@ def w_2d(config: W2dConfig, seed: int) -> Simulation:
     wheels = wheel_odometry(motion.poses(stamps_ns), stamps_ns, config.slip, wheels_rng)
     starts = range(START_NS, motion.end_ns - laser.sweep_ns + 1, laser.period_ns)
     scans = (laser.scan(caster, motion, start) for start in starts)
+    frames = () if config.depth is None else _frames(config.depth, motion, floor, depth_rng)
     return Simulation(
         start_ns=START_NS,
         end_ns=motion.end_ns,
@@ -81,6 +92,7 @@ def w_2d(config: W2dConfig, seed: int) -> Simulation:
             [Record(START_NS, "/truth/plan", plan_of(floor))],
             (Record(m.stamp_ns, "/odom", m) for m in wheels),
             (Record(m.stamp_ns, "/truth", m) for m in _truth(motion)),
+            (Record(m.stamp_ns, "/depth/image", m) for m in frames),
             (Record(m.stamp_ns + laser.sweep_ns, "/scan", m) for m in scans),
             key=lambda record: record.log_ns,
         ),
@@ -112,6 +124,16 @@ def plan_of(floor: Office) -> OccupancyGrid:
     return OccupancyGrid(
         stamp_ns=START_NS, cells=cells, resolution_m=_PLAN_M, T_map_grid=T_world_grid
     )
+
+
+def _frames(
+    config: DepthCameraConfig, motion: Motion, floor: Office, rng: np.random.Generator
+) -> Iterator[CameraFrame]:
+    camera, caster = DepthCamera(config, DEPTH, rng), RayCaster(floor.mesh())
+    stamps_ns = stamps_at(config.rate_hz, (START_NS, motion.end_ns))
+    poses = motion.poses(stamps_ns) @ T_BASE_DEPTH.matrix
+    for stamp_ns, T in zip(stamps_ns.tolist(), poses, strict=True):
+        yield camera.image(caster, T, stamp_ns, T_BASE_DEPTH)
 
 
 def _truth(motion: Motion) -> list[Odometry]:
