@@ -89,7 +89,7 @@ def _ours(frames: Sequence[Frame], *, has_colors: bool) -> Figures:
 
     def step(frame: Frame) -> None:
         pinhole = Pinhole(camera_matrix=_K, T_map_camera=frame.T_map_camera)
-        depth_m = frame.depth_mm / np.float32(1000)
+        depth_m = frame.depth_mm.astype(np.float32) / np.float32(1000)
         depth_m[(depth_m == 0) | (depth_m > _MOST_M)] = np.nan
         view = DepthView(depth_m=depth_m, pinhole=pinhole)
         color = ColorView(rgb=frame.rgb, pinhole=pinhole)

@@ -14,6 +14,7 @@ from mapstream.operators.dense.mesh import MeshConfig, make_mesh
 from mapstream.operators.operator import (
     NoPorts,
     Operator,
+    OptionalPath,
     Placement,
     offload,
     report_written,
@@ -31,7 +32,9 @@ from mapstream.streams.messages.estimates import Submap
 class MeshSinkConfig(MeshConfig):
     """Options of `mesh_sink`: those of `mapstream map DIR mesh`, and the file."""
 
-    path: Path = Field(default=Path("mesh.ply"), description="the file, .ply or .glb, replaced")
+    path: OptionalPath = Field(
+        default=Path("mesh.ply"), description="the file, .ply or .glb, replaced; empty: none"
+    )
 
 
 @dataclass(frozen=True)
@@ -63,15 +66,19 @@ class MeshSink(Operator[Inputs, NoPorts]):
                 tasks.start_soon(self._keep_newest, inputs.maps)
                 if inputs.submaps is not None:
                     tasks.start_soon(self._keep_clouds, inputs.submaps, store)
-            if self._newest is None:
-                warn(f"no map came, so {self._config.path} was not written")
-                return
-            try:
-                await offload(self._write, self._newest, store.directory)
-            except MapError as error:
-                warn(f"{self._config.path} was not written: {error}")
-                return
-            report_written(self._config.path)
+            if self._config.path is not None:
+                await self._finish(self._config.path, store.directory)
+
+    async def _finish(self, path: Path, folder: Path) -> None:
+        if self._newest is None:
+            warn(f"no map came, so {path} was not written")
+            return
+        try:
+            await offload(self._write, self._newest, folder, path)
+        except MapError as error:  # the map itself is whole
+            warn(f"{path} was not written: {error}")
+            return
+        report_written(path)
 
     async def _keep_newest(self, maps: Receiver[Map]) -> None:
         async for map_ in maps:
@@ -83,16 +90,16 @@ class MeshSink(Operator[Inputs, NoPorts]):
 
     def _put(self, submap: Submap, store: CloudStore) -> None:
         mission = id_bytes(submap.mission_id)
-        for keyframe in submap.keyframes:
+        for keyframe in submap.keyframes if self._config.path is not None else ():
             vertex = vertex_id(mission, keyframe.stamp_ns)
             if keyframe.cloud is not None and vertex not in self._files:
                 key = cloud_key(submap.mission_id, keyframe.stamp_ns)
                 store.put(key, keyframe.cloud)
                 self._files[vertex] = store.path_of(key).name
 
-    def _write(self, map_: Map, folder: Path) -> None:
+    def _write(self, map_: Map, folder: Path, path: Path) -> None:
         owners = [i.tobytes() for i in map_.vertices.id]
         rows = [row for row, vertex in enumerate(owners) if vertex in self._files]
         paths = [self._files[owners[row]] for row in rows]
         map_ = add_resources(map_, vertex_rows=np.array(rows, np.int64), kind="cloud", paths=paths)
-        make_mesh(map_, folder, self._config.path, self._config)
+        make_mesh(map_, folder, path, self._config)

@@ -4,16 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, TypeVar
 
 import typer
 
 from mapstream.graph.cli.options import KeySetList, config_from
 from mapstream.graph.cli.output import JsonFlag, complain, fraction_bar, in_place, say, say_json
 from mapstream.operators.dense.fusion import FusionReport
-from mapstream.recordings.maps import load_map
+from mapstream.operators.operator import OperatorConfig
+from mapstream.recordings.maps import Map, load_map
 from mapstream.recordings.maps.history import change_map
 
+ConfigT = TypeVar("ConfigT", bound=OperatorConfig)
+ReportT = TypeVar("ReportT")
 VoxelOption = Annotated[
     float | None, typer.Option("--voxel-size-m", min=0.001, help="Edge of a voxel.")
 ]
@@ -114,14 +117,7 @@ def stereo_depth(
 
     folder: Path = context.obj
     config = config_from(tool.StereoDepthConfig, set_)
-    settings = config.model_dump(mode="json", exclude_defaults=True)
-    with fraction_bar("matching") as show:
-        report = change_map(
-            folder,
-            "stereo-depth",
-            lambda map_: tool.stereo_depth(map_, folder, config, show),
-            **settings,
-        )
+    report = _changed(folder, "stereo-depth", tool.stereo_depth, config)
     if json:
         say_json(report)
         return
@@ -139,14 +135,7 @@ def depth_clouds(
 
     folder: Path = context.obj
     config = config_from(tool.DepthCloudsConfig, set_)
-    settings = config.model_dump(mode="json", exclude_defaults=True)
-    with fraction_bar("projecting") as show:
-        report = change_map(
-            folder,
-            "depth-clouds",
-            lambda map_: tool.depth_clouds(map_, folder, config, show),
-            **settings,
-        )
+    report = _changed(folder, "depth-clouds", tool.depth_clouds, config)
     if json:
         say_json(report)
         return
@@ -184,6 +173,20 @@ def export_for_pmvs(
 ) -> None:
     """Write images without distortion and projections as PMVS wants them."""
     export_images(context, out, set_=["form=pmvs"], json=json)
+
+
+def _changed(
+    folder: Path,
+    operation: str,
+    tool: Callable[[Map, Path, ConfigT, Callable[[float], None]], tuple[Map, ReportT]],
+    config: ConfigT,
+) -> ReportT:
+    """Let a tool change the map, with a bar on a terminal, and return its report."""
+    settings = config.model_dump(mode="json", exclude_defaults=True)
+    with fraction_bar(operation) as show:
+        return change_map(
+            folder, operation, lambda map_: tool(map_, folder, config, show), **settings
+        )
 
 
 def _sets(

@@ -23,9 +23,9 @@ SIZE = {"width_px": 200, "height_px": 150}
 TOPICS = ("/color/image", "/depth/image")
 
 
-def write_recording(path: Path) -> None:
-    """Write the recording: a picture of each kind every third of a second."""
-    camera = {**SIZE, "rate_hz": 3.0, "format": "png"}
+def write_recording(path: Path, *, rate_hz: float = 2.0) -> None:
+    """Write the recording, with so many pictures of each kind in a second."""
+    camera = {**SIZE, "rate_hz": rate_hz, "format": "png"}
     simulate("w_rgbd", path, seed=0, duration_s=DURATION_S, camera=camera, texel_m=0.03)
 
 

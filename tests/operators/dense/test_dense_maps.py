@@ -48,7 +48,7 @@ def away_m(points: Float32Array) -> FloatArray:
     squared, _, _ = igl.point_mesh_squared_distance(
         points.astype(np.float64), np.concatenate(corners), np.array(faces)
     )
-    return np.sqrt(squared)
+    return np.asarray(np.sqrt(squared), np.float64)
 
 
 def test_O3_O8_the_mesh_of_a_map_lies_on_the_surfaces_of_the_room(

@@ -67,7 +67,7 @@ def pair() -> tuple[CameraFrame, CameraFrame, Float32Array]:
     for name in ("right", "left"):
         place = PLACES[name]
         view = renderer.rendering(lens, place.matrix)
-        depth_m = 1 / view.inverse_depths
+        depth_m = np.reciprocal(view.inverse_depths)
         image = np.ascontiguousarray(view.image.reshape(HEIGHT, WIDTH, -1)[:, :, 0])
         frames.append(
             CameraFrame(
