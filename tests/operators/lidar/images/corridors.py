@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
@@ -42,35 +43,57 @@ class Drive:
         return [SE3(T) for T in self.motion.poses(ends)]
 
 
-def spin(num_scans: int, beams: int = 64, columns: int = 1024) -> Drive:
+def spin(num_scans: int) -> Drive:
     """Scans from within a turn at 90 deg/s, at 3 m/s."""
     config = WLidConfig(length_m=40.0, aggressive=True)
-    ring, rng = Ring(config.length_m), np.random.default_rng(3)
-    motion = drive(ring, config)
-    caster = RayCaster(Corridor(ring, rng).mesh())
-    lidar = Lidar(LidarConfig(beams=beams, columns=columns), T_BASE_LIDAR, rng)
+    motion = drive(Ring(config.length_m), config)
     first_ns = motion.start_ns + round(_START_S * 1e9)
-    starts = range(first_ns, first_ns + num_scans * _PERIOD_NS, _PERIOD_NS)
-    return Drive(caster, motion, [lidar.scan(caster, motion, start) for start in starts])
+    return _seen(config, motion, [first_ns + k * _PERIOD_NS for k in range(num_scans)], 1024)
 
 
-def tracked(seen: Drive) -> list[ImageFeatures]:
-    """The keypoints of all scans, followed by the true motion."""
+def pass_twice(num_scans: int) -> Drive:
+    """Scans from one stretch of the corridors, and as many from the next time round."""
+    config = WLidConfig(length_m=36.0, overlap_fraction=0.4)
+    motion = drive(Ring(config.length_m), config)
+    first_ns = motion.start_ns + 5 * 10**9
+    later = np.arange(first_ns + 6 * 10**9, motion.end_ns - 2 * 10**9, 10**7)
+    place = motion.poses(np.array([first_ns]))[0, :3, 3]
+    nearest = np.argmin(np.linalg.norm(motion.poses(later)[:, :3, 3] - place, axis=1))
+    starts = [
+        start + k * _PERIOD_NS
+        for start in (first_ns, int(later[nearest]))
+        for k in range(num_scans)
+    ]
+    return _seen(config, motion, starts, 512)
+
+
+def _seen(config: WLidConfig, motion: Motion, starts_ns: list[int], columns: int) -> Drive:
+    rng = np.random.default_rng(3)
+    caster = RayCaster(Corridor(Ring(config.length_m), rng).mesh())
+    lidar = Lidar(LidarConfig(beams=64, columns=columns), T_BASE_LIDAR, rng)
+    return Drive(caster, motion, [lidar.scan(caster, motion, start) for start in starts_ns])
+
+
+def tracked(seen: Drive, poses: list[SE3] | None = None) -> list[ImageFeatures]:
+    """The keypoints of all scans, followed by the true motion or another one."""
     keypoints, tracks = LidarKeypoints(LidarKeypointsConfig()), LidarTracks(LidarTracksConfig())
     return [
         tracks.track(keypoints.detect(scan), pose)
-        for scan, pose in zip(seen.scans, seen.poses(), strict=True)
+        for scan, pose in zip(seen.scans, poses or seen.poses(), strict=True)
     ]
 
 
-def mapped(seen: Drive, features: list[ImageFeatures]) -> Map:
-    """A map with one vertex at the end of each scan, where the base truly was."""
-    poses, stamps_ns = seen.poses(), [scan.end_ns for scan in seen.scans]
+def mapped(
+    seen: Drive, features: Sequence[Sequence[ImageFeatures]], poses: list[SE3] | None = None
+) -> Map:
+    """A map with one vertex at the end of each scan, where the base truly was or is said to be."""
+    stamps_ns = [scan.end_ns for scan in seen.scans]
+    poses = poses or seen.poses()
     keyframes = tuple(
         Keyframe(
             stamp_ns=stamp_ns,
             odometry=Odometry(stamp_ns=stamp_ns, T_odom_base=pose),
-            features=(each,),
+            features=tuple(each),
         )
         for stamp_ns, pose, each in zip(stamps_ns, poses, features, strict=True)
     )

@@ -129,7 +129,7 @@ def test_D17_landmarks_of_tracks_lie_on_the_walls(
     drive: Drive, tracks: list[ImageFeatures]
 ) -> None:
     """Across the walls they spread by less than 3 cm, where 5 are asked for."""
-    map_, report = create_landmarks(mapped(drive, tracks))
+    map_, report = create_landmarks(mapped(drive, [[each] for each in tracks]))
     count = np.bincount(map_.observations.landmark[map_.observations.landmark >= 0])
 
     points = map_.T_map_landmark(np.flatnonzero(count >= 3))[:, :3, 3]
@@ -159,7 +159,7 @@ def test_E16_sightings_of_a_landmark_meet_only_with_their_times(
     drive: Drive, tracks: list[ImageFeatures]
 ) -> None:
     """W-LID at 90 deg/s: those seen five times spread by less than 5 cm, without times by more than 15 cm."""
-    map_, _ = create_landmarks(mapped(drive, tracks))
+    map_, _ = create_landmarks(mapped(drive, [[each] for each in tracks]))
 
     with_times, without = (spreads_m(each, _LONG) for each in (map_, without_times(map_)))
 
@@ -187,7 +187,7 @@ def test_H8_half_of_what_a_lidar_sees_is_false_and_its_place_is_found(
     drive: Drive, tracks: list[ImageFeatures], vertex: int
 ) -> None:
     """Within 5 cm and 0.3 degrees, while it spins at 90 deg/s."""
-    map_, _ = create_landmarks(mapped(drive, tracks))
+    map_, _ = create_landmarks(mapped(drive, [[each] for each in tracks]))
     (view,) = VertexViews(map_).at(vertex)
     landmarks, own = sightings_at(map_, vertex, 0.5, seed=vertex)
     rows = np.searchsorted(view.rows, own)
