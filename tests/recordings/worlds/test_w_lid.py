@@ -24,6 +24,7 @@ from mapstream.recordings.worlds.w_lid import START_NS, T_BASE_IMU, WLidConfig, 
 from mapstream.streams.arrays import FloatArray
 from mapstream.streams.errors import ConfigError
 from mapstream.streams.geometry import SE3, invert, so3_exp
+from mapstream.streams.messages.estimates import Odometry
 from mapstream.streams.messages.sensors import LidarScan
 from mapstream.streams.trajectory import Trajectory
 
@@ -234,3 +235,28 @@ def test_an_interrupted_simulation_leaves_no_file(tmp_path: Path) -> None:
         simulate("w_lid", tmp_path / "w.mcap", on_progress=stop, **SMALL)
 
     assert list(tmp_path.iterdir()) == []
+
+
+def test_several_drives_share_a_building() -> None:
+    """Another start, the other way round, other noise: the corridors are the same."""
+    shared = {**SMALL, "building": 3}
+    drives = (
+        (SMALL, 3),
+        ({**shared, "start_fraction": 0.5}, 9),
+        ({**shared, "reverse": True}, 9),
+        (SMALL, 9),
+    )
+    poses, reach_m = [], []
+    for options, seed in drives:
+        records = list(islice(w_lid(WLidConfig.model_validate(options), seed).records, 400))
+        truth = next(r.message for r in records if r.topic == "/truth")
+        scan = next(r.message for r in records if r.topic == "/points")
+        assert isinstance(truth, Odometry)
+        assert isinstance(scan, LidarScan)
+        poses.append(truth.T_odom_base)
+        reach_m.append(float(np.linalg.norm(scan.points, axis=1).max()))
+
+    across = Ring(SMALL["length_m"]).points(np.array([18.0]), 0.0, 0.0)[0]
+    assert np.allclose(poses[1].t[:2], across[:2], atol=0.2)
+    assert np.allclose(poses[2].R[:2, :2], -np.eye(2), atol=0.01)
+    assert abs(reach_m[2] - reach_m[0]) < abs(reach_m[3] - reach_m[0])
