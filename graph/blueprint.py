@@ -15,7 +15,7 @@ from mapstream.graph.plan import Plan
 from mapstream.graph.tap_outputs import Output
 from mapstream.graph.views.run import GRAPH, graph_extent
 from mapstream.recordings.maps import Map
-from mapstream.streams.messages import estimates, sensors, vision
+from mapstream.streams.messages import estimates, grids, sensors, vision
 
 _IN_SPACE = (
     sensors.LidarScan,
@@ -29,6 +29,7 @@ _IN_SPACE = (
     estimates.LoopReport,
     estimates.MapCorrection,
     estimates.MapPose,
+    grids.OccupancyGrid,
     Map,
 )
 _PICTURES = (sensors.CameraFrame, sensors.EncodedImage)

@@ -17,7 +17,7 @@ from threading import Condition
 from typing import Any
 
 from mapstream.recordings.maps import Map
-from mapstream.streams.messages import estimates, sensors, vision
+from mapstream.streams.messages import estimates, grids, sensors, vision
 from mapstream.streams.sizes import nbytes
 
 
@@ -39,6 +39,7 @@ _WORTH = {
     vision.ImageFeatures: Worth.SAMPLE,
     estimates.MapCorrection: Worth.NEWEST,
     Map: Worth.NEWEST,
+    grids.OccupancyGrid: Worth.NEWEST,
     estimates.Submap: Worth.EVERY,
 }
 _ITEM_BYTES = 512  # what Python needs around a small message

@@ -15,6 +15,7 @@ from typing import cast
 
 from mapstream.graph.metrics import Snapshot
 from mapstream.graph.views.constraints import view_constraint
+from mapstream.graph.views.grids import view_occupancy_grid
 from mapstream.graph.views.images import (
     view_camera_frame,
     view_encoded_image,
@@ -46,7 +47,7 @@ from mapstream.graph.views.scene import Columns, Entry, Scene, View, ViewSetting
 from mapstream.graph.views.tracks import view_image_features, view_n_frame
 from mapstream.graph.views.unknown import view_unknown
 from mapstream.recordings.maps import Map
-from mapstream.streams.messages import constraints, estimates, planes, sensors, vision
+from mapstream.streams.messages import constraints, estimates, grids, planes, sensors, vision
 
 __all__ = [
     "GROUP",
@@ -79,6 +80,7 @@ _BUILT_IN: dict[type, View] = {
     estimates.LoopReport: view_loop_report,
     estimates.MapCorrection: view_map_correction,
     estimates.MapPose: view_map_pose,
+    grids.OccupancyGrid: view_occupancy_grid,
     planes.PlaneSegments: view_plane_segments,
     vision.ImageFeatures: view_image_features,
     vision.NFrame: view_n_frame,
