@@ -12,7 +12,7 @@ from small_gicp import KdTree, PointCloud
 from mapstream.operators.lidar.observability import observability_of_planes
 from mapstream.streams.arrays import FloatArray
 
-_NUM_PLACES = 1000
+_NUM_PLACES = 500
 _NUM_NEIGHBOURS = 12
 _FLAT = 0.1  # a surface's points are so much farther spread in either direction than across ...
 _WIDE = 0.05  # ... and no line
