@@ -5,9 +5,6 @@ Source: Kerl, Sturm, Cremers: Dense Visual SLAM for RGB-D Cameras, IROS 2013, se
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import ClassVar
-
 from pydantic import Field, PositiveFloat
 
 from mapstream.operators.features.gray import gray
@@ -15,14 +12,13 @@ from mapstream.operators.images.calibrated import require_camera
 from mapstream.operators.images.depth import depth_m_of
 from mapstream.operators.odometry.dense.tracker import DenseTracker, DenseTrackerConfig, View
 from mapstream.operators.odometry.dense.views import Level, levels_of
-from mapstream.operators.operator import Operator, Placement, offload, warn
+from mapstream.operators.odometry.rgbd.paired import PairedOdometry, require_registered
+from mapstream.operators.operator import warn
 from mapstream.streams.arrays import FloatArray
-from mapstream.streams.channel import Receiver, Sender
 from mapstream.streams.errors import EstimationError, OperatorError
 from mapstream.streams.geometry import SE3, straightened
 from mapstream.streams.messages.estimates import Odometry
 from mapstream.streams.messages.sensors import CameraFrame
-from mapstream.streams.sync import anchored, nearest
 
 
 class DenseVisualOdometryConfig(DenseTrackerConfig):
@@ -36,22 +32,7 @@ class DenseVisualOdometryConfig(DenseTrackerConfig):
     max_depth_m: PositiveFloat = 6.0
 
 
-@dataclass(frozen=True)
-class Inputs:
-    """Colour or gray images, and depth in the same camera (see `depth_registration`)."""
-
-    frames: Receiver[CameraFrame]
-    depth: Receiver[CameraFrame]
-
-
-@dataclass(frozen=True)
-class Outputs:
-    """One per image with depth; the odom frame is the base at the first of them."""
-
-    odometry: Sender[Odometry]
-
-
-class DenseVisualOdometry(Operator[Inputs, Outputs]):
+class DenseVisualOdometry(PairedOdometry):
     """Find the motion of a camera that makes colours and depths of whole images agree.
 
     Each image is compared with a keyframe, which is replaced where it tells too little. An image that does not
@@ -59,22 +40,11 @@ class DenseVisualOdometry(Operator[Inputs, Outputs]):
     was, and says so.
     """
 
-    placement: ClassVar[Placement] = "process"  # numpy on small matrices holds the GIL
-
     def __init__(self, config: DenseVisualOdometryConfig) -> None:
+        super().__init__(config.max_apart_s)
         self._config = config
         self._tracker: DenseTracker | None = None  # from the first image on
         self._last_ns = 0  # stamp of the last image
-
-    async def run(self, inputs: Inputs, outputs: Outputs) -> None:
-        apart_ns = round(self._config.max_apart_s * 1e9)
-        pairs = anchored(inputs.frames, nearest(inputs.depth, apart_ns))
-        async for frame, depth in pairs:
-            odometry = await offload(self.track, frame, depth)
-            if odometry is not None:
-                await outputs.odometry.send(odometry)
-        if pairs.stats.unmatched:
-            warn(pairs.explain())
 
     def track(self, frame: CameraFrame, depth: CameraFrame) -> Odometry | None:
         """Return the odometry at an image; None if it comes out of order.
@@ -108,11 +78,7 @@ class DenseVisualOdometry(Operator[Inputs, Outputs]):
                 f"images of {frame.frame} are of a {camera.model} camera with distortion "
                 f"{camera.distortion}; put undistort before dense_visual_odometry"
             )
-        if depth.image.shape != frame.image.shape[:2]:
-            raise OperatorError(
-                f"depth of {depth.frame} is {depth.image.shape}, images of {frame.frame} are "
-                f"{frame.image.shape[:2]}; put depth_registration before dense_visual_odometry"
-            )
+        require_registered(frame, depth, "dense_visual_odometry")
         depth_m = depth_m_of(depth, least_m=config.min_depth_m, most_m=config.max_depth_m)
         return levels_of(gray(frame), depth_m, camera, config.width_px)
 

@@ -2,26 +2,22 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import ClassVar
-
 import numpy as np
 from pydantic import Field, PositiveFloat
 
 from mapstream.operators.features.gray import gray
 from mapstream.operators.images.calibrated import require_camera
 from mapstream.operators.images.depth import PixelRays, depth_m_of
+from mapstream.operators.odometry.rgbd.paired import PairedOdometry, require_registered
 from mapstream.operators.odometry.rgbd.shape import Shape, shape_of
 from mapstream.operators.odometry.rgbd.shape_fit import ShapeFit, fit_shape
 from mapstream.operators.odometry.uncertainty import chain, unmeasured
-from mapstream.operators.operator import Operator, OperatorConfig, Placement, offload, warn
+from mapstream.operators.operator import OperatorConfig, warn
 from mapstream.streams.arrays import FloatArray
-from mapstream.streams.channel import Receiver, Sender
-from mapstream.streams.errors import EstimationError, OperatorError
+from mapstream.streams.errors import EstimationError
 from mapstream.streams.geometry import SE3, invert, so3_log, straightened
 from mapstream.streams.messages.estimates import Odometry
 from mapstream.streams.messages.sensors import CameraFrame
-from mapstream.streams.sync import anchored, nearest
 
 _RADIAN_M = 0.5  # a keyframe turned by a radian is as far as one half a metre away
 
@@ -44,22 +40,7 @@ class RgbdOdometryConfig(OperatorConfig):
     """With a smaller share of its surface on that of the keyframes an image is lost."""
 
 
-@dataclass(frozen=True)
-class Inputs:
-    """Colour or gray images, and depth in the same camera (see `depth_registration`)."""
-
-    frames: Receiver[CameraFrame]
-    depth: Receiver[CameraFrame]
-
-
-@dataclass(frozen=True)
-class Outputs:
-    """One per image with depth; the odom frame is the base at the first of them."""
-
-    odometry: Sender[Odometry]
-
-
-class RgbdOdometry(Operator[Inputs, Outputs]):
+class RgbdOdometry(PairedOdometry):
     """Find the pose of a camera by the planes and the edges it sees.
 
     Needs no texture and no high frame rate: the camera may move by 0.2 m from image to image. Surfaces count by
@@ -68,9 +49,8 @@ class RgbdOdometry(Operator[Inputs, Outputs]):
     that fits none of them is lost: it stays where the last one was, and says so.
     """
 
-    placement: ClassVar[Placement] = "process"  # numpy on small matrices holds the GIL
-
     def __init__(self, config: RgbdOdometryConfig) -> None:
+        super().__init__(config.max_apart_s)
         self._config = config
         self._keyframes: list[tuple[FloatArray, Shape]] = []  # T_odom_camera (4, 4), oldest first
         self._T: FloatArray = np.eye(4)  # T_odom_camera of the last image
@@ -79,16 +59,6 @@ class RgbdOdometry(Operator[Inputs, Outputs]):
         )  # of the last pose of the base, perturbed on the right
         self._last_ns: int | None = None
         self._rays = PixelRays()
-
-    async def run(self, inputs: Inputs, outputs: Outputs) -> None:
-        apart_ns = round(self._config.max_apart_s * 1e9)
-        pairs = anchored(inputs.frames, nearest(inputs.depth, apart_ns))
-        async for frame, depth in pairs:
-            odometry = await offload(self.track, frame, depth)
-            if odometry is not None:
-                await outputs.odometry.send(odometry)
-        if pairs.stats.unmatched:
-            warn(pairs.explain())
 
     def track(self, frame: CameraFrame, depth: CameraFrame) -> Odometry | None:
         """Return the odometry at an image; None if it comes out of order.
@@ -129,11 +99,7 @@ class RgbdOdometry(Operator[Inputs, Outputs]):
 
     def _shape(self, frame: CameraFrame, depth: CameraFrame) -> Shape:
         camera, config = require_camera(frame), self._config
-        if depth.image.shape != frame.image.shape[:2]:
-            raise OperatorError(
-                f"depth of {depth.frame} is {depth.image.shape}, images of {frame.frame} are "
-                f"{frame.image.shape[:2]}; put depth_registration before rgbd_odometry"
-            )
+        require_registered(frame, depth, "rgbd_odometry")
         depth_m = depth_m_of(depth, least_m=config.min_depth_m, most_m=config.max_depth_m)
         return shape_of(gray(frame), depth_m, self._rays.of(camera))
 
