@@ -91,9 +91,8 @@ class DenseTracker:
     def lose(self, stamp_ns: int, levels: list[Level], duration_s: float) -> FloatArray:
         """Stay where the last image was, and begin anew there after many; return the covariance (6, 6) of the step."""
         self._rate, self._num_lost = np.zeros(6), self._num_lost + 1
-        of_step = self._covariance = unmeasured(
-            duration_s
-        )  # the next step undoes what this one missed
+        # the next step undoes what this one missed
+        of_step = self._covariance = unmeasured(duration_s)
         if self._num_lost >= self._config.max_lost:
             self._last, self._num_lost = View(stamp_ns, levels, self.T_odom_camera), 0
             self._take_keyframe(self._last)
