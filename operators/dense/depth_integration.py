@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from mapstream.operators.dense.depth_views import ColorView, DepthView, Pinhole
+from mapstream.operators.dense.silhouettes import least_distances_m
 from mapstream.operators.dense.volume import PLACES, SIDE, VOXELS, TsdfVolume
 from mapstream.streams.arrays import BoolArray, Float32Array, IntArray
 
@@ -50,7 +51,7 @@ def integrate_depth(
         others = np.flatnonzero(~is_wanted)
         is_wanted[others[_is_in_view(volume, others, view)]] = True
     chosen = np.flatnonzero(is_wanted)
-    lookup = _Lookup(view)
+    lookup = _Lookup(volume, view)
     for start in range(0, len(chosen), _CHUNK):
         _update(volume, chosen[start : start + _CHUNK], lookup)
 
@@ -58,10 +59,12 @@ def integrate_depth(
 class _Lookup:
     """What is the same for all blocks of a view."""
 
-    def __init__(self, view: DepthView) -> None:
+    def __init__(self, volume: TsdfVolume, view: DepthView) -> None:
         self.height, self.width = view.depth_m.shape
         nothing = np.full(1, np.nan, np.float32)  # the pixel of what is not in the image
         self.depth_m = np.concatenate([view.depth_m.ravel(), nothing])
+        least_m = least_distances_m(view, volume.voxel_size_m, volume.truncation_m)
+        self.least_m = np.concatenate([least_m.ravel(), nothing])
         self.pinhole, self.color = view.pinhole, view.color
 
 
@@ -71,7 +74,7 @@ def _update(volume: TsdfVolume, rows: IntArray, lookup: _Lookup) -> None:
     x, y, z = _projected(volume, rows, lookup.pinhole)
     pixel = _pixels(x, y, z, lookup.width, lookup.height)
     distance_m = lookup.depth_m.take(pixel) - z
-    is_seen = distance_m > -truncation_m  # false where there is no depth
+    is_seen = distance_m > lookup.least_m.take(pixel)  # false where there is no depth
     if not is_seen.any():
         return
     fading = np.float32(1 / max(volume.truncation_m - volume.voxel_size_m, 1e-9))

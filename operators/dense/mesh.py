@@ -20,8 +20,6 @@ class MeshConfig(FusionConfig):
     """Voxels of no more weight count as not seen; a depth image weighs 1 at 1 m and 1/16 at 4 m, a point of a cloud 1."""
     min_part_faces: NonNegativeInt = 100
     """Parts of the surface with fewer triangles are left out."""
-    keeps_curtains: bool = False
-    """Keep what hangs behind the edges of things, between their unseen backs and the free space beside them."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -48,11 +46,6 @@ def make_mesh(
     """
     check_mesh_path(path)
     volume, fused = fuse(map_, folder, config, on_progress=on_progress)
-    mesh = surface_of(
-        volume,
-        min_weight=config.min_weight,
-        min_part_faces=config.min_part_faces,
-        keeps_curtains=config.keeps_curtains,
-    )
+    mesh = surface_of(volume, min_weight=config.min_weight, min_part_faces=config.min_part_faces)
     write_mesh(path, mesh)
     return MeshReport(fused=fused, num_vertices=len(mesh.vertices), num_faces=len(mesh.faces))

@@ -23,7 +23,6 @@ ScalarT = TypeVar("ScalarT", bound=np.generic)
 _CORNERS = np.array(
     [[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [0, 0, 1], [1, 0, 1], [1, 1, 1], [0, 1, 1]]
 )  # of a cell, in the order of the tables
-_MOST_STEP = 0.99  # of the truncation, between the corners of a cell
 _UNSEEN = 128.0  # the grey of what no camera saw
 _CHUNK = 2048  # blocks at a time
 _BITS = 20  # of a voxel's coordinate on each axis
@@ -50,11 +49,7 @@ class _Piece:
 
 
 def surface_of(
-    volume: TsdfVolume,
-    *,
-    min_weight: float = 0.0,
-    min_part_faces: int = 0,
-    keeps_curtains: bool = False,
+    volume: TsdfVolume, *, min_weight: float = 0.0, min_part_faces: int = 0
 ) -> SurfaceMesh:
     """Return the surface where distances change their sign, seen from where they are positive.
 
@@ -64,17 +59,14 @@ def surface_of(
         volume: With what was integrated.
         min_weight: Voxels of no more weight count as not seen; the surface ends there.
         min_part_faces: Parts of the surface with fewer triangles are left out.
-        keeps_curtains: Keep what hangs behind the edges of things, between their unseen backs and the free
-            space beside them. Distances jump there by the whole truncation, which no surface does.
 
     Raises:
         MapError: If the volume holds no surface.
     """
     pieces = []
-    most_m = np.inf if keeps_curtains else _MOST_STEP * volume.truncation_m
     for start in range(0, len(volume), _CHUNK):
         rows = np.arange(start, min(start + _CHUNK, len(volume)))
-        cells = _cells(volume, rows, min_weight, most_m)
+        cells = _cells(volume, rows, min_weight)
         if len(cells.voxels):
             pieces.append(_marched(cells))
     if not pieces:
@@ -120,23 +112,17 @@ def without_small_parts(mesh: SurfaceMesh, min_faces: int) -> SurfaceMesh:
     )
 
 
-def _cells(volume: TsdfVolume, rows: IntArray, min_weight: float, most_m: float) -> _Cells:
-    """Return the cells that begin in some blocks, and that the surface passes through.
-
-    Distances within one must not differ by more than `most_m`.
-    """
+def _cells(volume: TsdfVolume, rows: IntArray, min_weight: float) -> _Cells:
+    """Return the cells that begin in some blocks, and that the surface passes through."""
     is_seen = _with_neighbours(volume, rows, volume.weight > min_weight)
     distance_m = _with_neighbours(volume, rows, volume.distance_m)
-    shape = (len(rows), SIDE, SIDE, SIDE)
-    is_whole = np.ones(shape, np.bool_)
-    least, most = np.full(shape, np.inf, np.float32), np.full(shape, -np.inf, np.float32)
+    is_whole, is_in, is_out = (np.ones((len(rows), SIDE, SIDE, SIDE), np.bool_) for _ in range(3))
     for corner in _CORNERS.tolist():
         x, y, z = (slice(offset, offset + SIDE) for offset in corner)
         is_whole &= is_seen[:, x, y, z]
-        np.minimum(least, distance_m[:, x, y, z], out=least)
-        np.maximum(most, distance_m[:, x, y, z], out=most)
-    is_crossed = (least < 0) & (most >= 0) & (most - least <= most_m)
-    block, *place = np.nonzero(is_whole & is_crossed)
+        is_in &= distance_m[:, x, y, z] < 0
+        is_out &= distance_m[:, x, y, z] >= 0
+    block, *place = np.nonzero(is_whole & ~is_in & ~is_out)
     corners = np.stack(place, axis=1)[:, None, :] + _CORNERS  # (C, 8, 3) in their blocks
     inside = block[:, None], *np.moveaxis(corners, 2, 0)
     voxels = volume.blocks[rows[block]][:, None, :] * SIDE + corners

@@ -58,7 +58,10 @@ def test_O3_O8_the_mesh_of_a_map_lies_on_the_surfaces_of_the_room(
     map_, folder = room
 
     report = make_mesh(
-        map_, folder, tmp_path / "room.glb", MeshConfig(voxel_size_m=VOXEL_M, min_part_faces=30)
+        map_,
+        folder,
+        tmp_path / "room.glb",
+        MeshConfig(voxel_size_m=VOXEL_M, min_weight=0.1, min_part_faces=30),
     )
 
     mesh = read_mesh(tmp_path / "room.glb")

@@ -65,7 +65,7 @@ def test_O4_any_distances_inside_a_frame_give_a_closed_surface(seed: int) -> Non
     is_border = ((voxels == low) | (voxels == high)).any(axis=2)
     volume.distance_m[:] = np.where(is_border, 1.0, rng.normal(size=(len(rows), VOXELS)))
 
-    assert is_closed(surface_of(volume, keeps_curtains=True))
+    assert is_closed(surface_of(volume))
 
 
 @pytest.mark.parametrize("uses_normals", [True, False])
