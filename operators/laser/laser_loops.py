@@ -31,10 +31,12 @@ class LaserLoopsConfig(LoopSearchConfig):
     """By so much per metre travelled since a loop closed, `max_distance_m` grows."""
     spacing_m: PositiveFloat = 1.0
     """Path between two searches."""
-    neighbours: NonNegativeInt = 5
+    neighbours: NonNegativeInt = 8
     """Keyframes on either side whose scans are merged."""
-    min_inlier_fraction: PositiveFloat = 0.65
-    """Of the points, for a match to be believed."""
+    overlap_radius_m: PositiveFloat = 4.0
+    """Points so near the robot must fit; what lies farther away may have been in sight only once."""
+    min_inlier_fraction: PositiveFloat = 0.6
+    """Of the points within that radius, for a match to be believed."""
     cell_m: PositiveFloat = 0.05
     """One point is compared in each."""
     search_distance_m: PositiveFloat = 0.4
@@ -73,6 +75,7 @@ class LaserLoops(Operator[Inputs, Outputs]):
     def __init__(self, config: LaserLoopsConfig) -> None:
         matcher = PlanarMatcher(
             turn_rad=float(np.radians(config.max_turn_deg)),
+            overlap_radius_m=config.overlap_radius_m,
             cell_m=config.cell_m,
             config=MatchConfig(
                 search_distance_m=config.search_distance_m,

@@ -31,7 +31,8 @@ _SHRINK = 0.8  # of the search distance, at each step
 _NOISE_FLOOR_M = 0.01  # of a range
 _CORRELATION = 9.0  # neighbouring beams share their errors: so many count as one
 _NORMAL_ERROR_RAD = 0.03  # what lines seem to see along themselves is noise
-_CONVERGED = np.array([1e-4, 5e-4, 5e-4])  # [rad, m, m]
+_CONVERGED = np.array([1e-4, 5e-4, 5e-4])  # [rad, m, m] of a step
+_SETTLED = 10.0  # steps so many times as large, where pairs change to and fro, are settled too
 
 
 @dataclass(frozen=True, slots=True)
@@ -124,8 +125,9 @@ def match(
             f"scans of {len(source)} points and {len(target.surface)} on lines cannot be matched;"
             f" at least {_MIN_PAIRS} are needed"
         )
-    pose, distance_m, converged = guess.astype(np.float64), config.search_distance_m, False
+    pose, distance_m = guess.astype(np.float64), config.search_distance_m
     pairs = _pairs(source, target, pose, distance_m)
+    step = np.full(3, np.inf)
     for _ in range(config.max_iterations):
         if pairs.num < _MIN_PAIRS:
             break
@@ -134,10 +136,16 @@ def match(
         is_last = distance_m <= config.final_distance_m
         distance_m = max(_SHRINK * distance_m, config.final_distance_m)
         pairs = _pairs(source, target, pose, distance_m)
-        converged = bool(is_last and (np.abs(step) < _CONVERGED).all())
-        if converged:
+        if is_last and (np.abs(step) < _CONVERGED).all():
             break
-    return _judged(pairs, pose, config, num_points=len(source), converged=converged)
+    settled = bool((np.abs(step) < _SETTLED * _CONVERGED).all())
+    return _judged(pairs, pose, config, num_points=len(source), converged=settled)
+
+
+def fit(source: Surface, target: LineTarget, pose: FloatArray, config: MatchConfig) -> ScanMatch:
+    """Return how well the source fits where it is; it is not moved."""
+    pairs = _pairs(source, target, pose, config.final_distance_m)
+    return _judged(pairs, pose, config, num_points=len(source), converged=True)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -34,6 +34,11 @@ class Surface:
         R = rotation(pose[2])
         return Surface(self.points @ R.T + pose[:2], self.normals @ R.T, self.has_sides)
 
+    def within(self, radius_m: float) -> Surface:
+        """Return the points around the origin."""
+        keep = np.linalg.norm(self.points, axis=1) <= radius_m
+        return Surface(self.points[keep], self.normals[keep], self.has_sides)
+
     def lined(self) -> Surface:
         """Return the points that lie on lines."""
         keep = np.isfinite(self.normals[:, 0])
