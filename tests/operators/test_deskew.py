@@ -7,6 +7,7 @@ from mapstream.operators.lidar.deskew import deskew_along, deskew_by_velocity, g
 from mapstream.streams.geometry import SE3, invert, se3_exp
 from mapstream.streams.messages.sensors import ImuBatch
 from mapstream.streams.trajectory import Trajectory
+from tests.data import shared
 
 SWEEP_NS = 100_000_000
 
@@ -88,3 +89,48 @@ def test_the_gyroscope_turns_the_base_whatever_way_it_is_mounted() -> None:
 
     np.testing.assert_allclose(motion.log()[:3], [0, 0, 0.5], atol=1e-9)
     np.testing.assert_allclose(motion.t, [1.0, 0, 0], atol=1e-9)
+
+
+@pytest.mark.parametrize("number", [0, 1, 2])
+def test_a_real_sweep_that_turns_is_undistorted_within_2_cm(number: int) -> None:
+    """Newer College, up to 95 deg/s: its motion from half of the points, the other half is compared.
+
+    The clouds that are given were undistorted with an IMU, which is not; so their own frame says the motion.
+    """
+    folder = shared("newer_college_deskew")
+    seen, given = (
+        np.fromfile(folder / f"{name}_{number:02d}.bin", np.float32).reshape(-1, 3).astype(float)
+        for name in ("raw", "deskewed")
+    )
+    times_s = np.fromfile(folder / f"times_{number:02d}.bin", np.float32).astype(float)
+    stamps_ns = 1_700_000_000 * 10**9 + np.rint(times_s * 1e9).astype(np.int64)
+    order = np.argsort(stamps_ns, kind="stable")
+    seen, given, stamps_ns = seen[order], given[order], stamps_ns[order]
+    pieces = np.array_split(np.arange(0, len(seen), 2), 150)
+    knots_ns = np.array([int(np.mean(stamps_ns[piece] - stamps_ns[0])) for piece in pieces])
+    poses = np.array([rigid(seen[piece], given[piece]) for piece in pieces])
+    trajectory = Trajectory(stamps_ns=stamps_ns[0] + knots_ns, poses=poses)
+    inside = np.arange(1, len(seen), 2)
+    inside = inside[[trajectory.covers(int(stamp_ns)) for stamp_ns in stamps_ns[inside]]]
+
+    found = deskew_along(seen[inside], stamps_ns[inside], trajectory)
+
+    assert misfit_m(found, given[inside]) < 0.005
+    assert misfit_m(seen[inside], given[inside]) > 0.3
+
+
+def misfit_m(source: np.ndarray, target: np.ndarray) -> float:
+    """Return the rms distance of points (N, 3) from their partners, aligned as rigid bodies."""
+    T = rigid(source, target)
+    errors = source @ T[:3, :3].T + T[:3, 3] - target
+    return float(np.sqrt(np.mean(np.sum(errors**2, axis=1))))
+
+
+def rigid(source: np.ndarray, target: np.ndarray) -> np.ndarray:
+    """Return the transform (4, 4) that best takes points (N, 3) to their partners."""
+    middle, goal = source.mean(axis=0), target.mean(axis=0)
+    U, _, Vt = np.linalg.svd((source - middle).T @ (target - goal))
+    T = np.eye(4)
+    T[:3, :3] = Vt.T @ np.diag([1, 1, np.linalg.det(U @ Vt)]) @ U.T
+    T[:3, 3] = goal - T[:3, :3] @ middle
+    return T
