@@ -83,12 +83,12 @@ class KeyframeClouds:
         return np.concatenate(parts)
 
     def of_pair(self, a: int, b: int, neighbours: int) -> tuple[FloatArray, FloatArray]:
-        """Return the surroundings of two keyframes, which share no cloud.
+        """Return the surroundings of two keyframes, which share no cloud, with as many neighbours on all sides.
 
-        A cloud in both would fit itself, wherever the two really lie.
+        A cloud in both would fit itself, wherever the two really lie. With neighbours on one side alone, an error
+        that the poses have at each step would come back doubled, and grow with each round.
         """
         (place_a, rows_a), (place_b, rows_b) = self._place[a], self._place[b]
-        inner = neighbours
         if rows_a is rows_b:
-            inner = min(neighbours, max(0, (place_b - place_a - 1) // 2))
-        return self.around(a, neighbours, inner), self.around(b, inner, neighbours)
+            neighbours = min(neighbours, max(0, (abs(place_b - place_a) - 1) // 2))
+        return self.around(a, neighbours, neighbours), self.around(b, neighbours, neighbours)

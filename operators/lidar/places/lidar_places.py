@@ -17,7 +17,7 @@ from mapstream.operators.lidar.places.find_places import (
 )
 from mapstream.operators.lidar.places.place_matcher import ACCEPTED, Judged, PlaceMatcher
 from mapstream.operators.maps.passing_clouds import PassingClouds
-from mapstream.operators.operator import Operator, Placement, offload
+from mapstream.operators.operator import Operator, Placement, offload, warn
 from mapstream.operators.places.agreement import agreement
 from mapstream.recordings.maps.model import Map
 from mapstream.recordings.maps.submaps import append_submap
@@ -68,7 +68,8 @@ class LidarPlaces(Operator[Inputs, Outputs]):
         self._config = config
         self._map = Map.empty()
         self._clouds: KeyframeClouds | None = None
-        self._matcher = PlaceMatcher(config, self._points)
+        self._past: dict[int, PlaceMatcher] = {}  # by mission: what it saw a while ago
+        self._whole: dict[int, PlaceMatcher] = {}  # by mission: all that it saw
         self._waiting: dict[int, deque[tuple[int, float]]] = {}  # by mission: vertex, way [m]
         self._way: dict[int, tuple[float, FloatArray]] = {}  # by mission: way [m], where
         self._looked_m: dict[int, float] = {}  # by mission: where on the way was looked last
@@ -123,24 +124,25 @@ class LidarPlaces(Operator[Inputs, Outputs]):
     def _compare(self, vertex: int) -> list[Judged]:
         """Return what became of a keyframe's likeliest places, and remember it for later ones."""
         mission = int(self._map.vertices.mission[vertex])
+        past = self._past.setdefault(mission, PlaceMatcher(self._config, self._points))
+        whole = self._whole.setdefault(mission, PlaceMatcher(self._config, self._points))
         waiting = self._waiting.setdefault(mission, deque())
-        way_m = self._way[mission][0]
-        while waiting and way_m - waiting[0][1] >= self._config.min_path_m:
-            self._add(waiting.popleft()[0])
-        for other in self._waiting.keys() - {mission}:  # those do not wait for their own way
-            while self._waiting[other]:
-                self._add(self._waiting[other].popleft()[0])
+        way_m, points = self._way[mission][0], self._points(vertex)
+        judged: list[Judged] = []
+        try:
+            if self._config.within:
+                while waiting and way_m - waiting[0][1] >= self._config.min_path_m:
+                    past.add(waiting.popleft()[0])
+                judged += past.recognize(points)
+            if self._config.between:
+                for other in sorted(self._whole.keys() - {mission}):
+                    judged += self._whole[other].recognize(points)
+                whole.add(vertex)
+        except EstimationError as error:
+            warn(f"a keyframe cannot be looked at from above: {error}")
+            return []
         waiting.append((vertex, way_m))
-        try:
-            return self._matcher.recognize(self._points(vertex))
-        except EstimationError:
-            return []  # it sees no ground, and is not added for the same reason
-
-    def _add(self, vertex: int) -> None:
-        try:
-            self._matcher.add(vertex)
-        except EstimationError:
-            return
+        return judged
 
     def _believed(self, vertex: int, judged: Judged) -> list[RelativePose]:
         """Return the loops that are believed now: this one, or all that agree with it between two missions."""
@@ -160,9 +162,7 @@ class LidarPlaces(Operator[Inputs, Outputs]):
             is_switchable=True,
         )
         if a == b:
-            return [edge] if self._config.within else []
-        if not self._config.between:
-            return []
+            return [edge]
         T_b = vertices.T_mission_base_of(vertex)
         T_a_b = vertices.T_mission_base_of(place) @ edge.T_a_b @ T_b.inverse()
         return self._agreed(_Claim(edge, T_a_b.matrix, T_b.t))
