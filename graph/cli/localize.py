@@ -16,6 +16,7 @@ from mapstream.graph.cli.localize_graphs import (
     lidar_graph,
 )
 from mapstream.graph.cli.localize_laser import is_for_laser, laser_graph
+from mapstream.graph.cli.localize_planes import is_for_planes, planes_graph
 from mapstream.graph.cli.options import KeySetList
 from mapstream.graph.cli.output import JsonFlag, in_place, plain, say, say_json, say_table
 from mapstream.graph.cli.planning import Request, plan_request
@@ -93,6 +94,8 @@ def _graph(
     is_open = camera is None and lidar is None
     if is_open and is_for_laser(map_, recording):
         return laser_graph(map_, recording, odometry)
+    if is_open and is_for_planes(map_, recording):
+        return planes_graph(map_, recording, odometry)
     if lidar is not None or (is_open and is_for_lidar(map_, recording)):
         return lidar_graph(map_, recording, lidar, odometry)
     return camera_graph(map_, recording, camera, odometry)

@@ -14,6 +14,7 @@ from mapstream.operators.operator import Operator, OperatorConfig, Placement, of
 from mapstream.operators.places.drift import Drift, DriftConfig, Fix
 from mapstream.operators.planes.known_planes import KnownPlanes, Reach
 from mapstream.operators.planes.period import Period
+from mapstream.operators.planes.plane_evidence import KnownOutlines, samples_of
 from mapstream.operators.planes.plane_pose import PlaneNoise, pose_covariance, pose_from_planes
 from mapstream.operators.planes.plane_search import (
     SearchLimits,
@@ -34,9 +35,7 @@ from mapstream.streams.messages.planes import PlaneSegments
 from mapstream.streams.sync import merge
 
 _OPEN = 10.0  # rad, m: of directions that the planes of one moment leave open
-_LEAST_SHARE = (
-    0.5  # of the planes of a moment that lie on known ones, where the robot is as thought
-)
+_IN_DOUBT = 3  # moments one after another that contradict the pose: then the robot is lost
 
 
 class LocalizePlanesConfig(OperatorConfig):
@@ -108,6 +107,7 @@ class LocalizePlanes(Operator[Inputs, Outputs]):
         self._recent = KnownPlanes(_reach(config), "recent")
         self._waiting: list[PlaneSegments] = []
         self._has_tracked = self._was_tracking = False
+        self._num_doubts = 0
 
     async def run(self, inputs: Inputs, outputs: Outputs) -> None:
         await offload(self._known)
@@ -160,23 +160,40 @@ class LocalizePlanes(Operator[Inputs, Outputs]):
             for pose, hull in zip(planes.T_base_plane, planes.hulls_m, strict=True)
             if len(hull) >= 3
         ]
-        self._recent.see(planes.stamp_ns, pieces, T.matrix, self._where.path_m)
         T_map_odom = self._drift.T_map_odom(planes.stamp_ns)
+        found = 0
         if T_map_odom is not None and pieces:
-            found = self._track(planes.stamp_ns, pieces, T, T_map_odom)
-            if found:
-                return found, "accepted"
-        return self._search(planes.stamp_ns, T)
+            found = self._track(planes, pieces, T, T_map_odom)
+            self._num_doubts = 0 if found else self._num_doubts + 1
+            if self._num_doubts == 1:  # what was seen before may be of another place
+                self._recent = KnownPlanes(_reach(self._config), "recent")
+            elif self._num_doubts == _IN_DOUBT:
+                self._drift = Drift(self._config.drift)
+                self._drift.move(T)
+        self._recent.see(planes.stamp_ns, pieces, T.matrix, self._where.path_m)
+        return (found, "accepted") if found else self._search(planes.stamp_ns, T)
 
     def _track(
-        self, stamp_ns: int, pieces: Sequence[SeenPlane], T_odom_base: SE3, T_map_odom: SE3
+        self,
+        planes: PlaneSegments,
+        pieces: Sequence[SeenPlane],
+        T_odom_base: SE3,
+        T_map_odom: SE3,
     ) -> int:
-        """Lay what is seen on what should be; return how many planes did, 0 if too few of them."""
+        """Lay what is seen on what should be; return how many planes did, 0 if they contradict the map there."""
         known, seen = self._known(), _moved(pieces, T_odom_base.inverse())
-        pairs = matches(known, seen, T_map_odom @ T_odom_base, self._limits)
-        if len(set(pairs[:, 0].tolist())) < max(1.0, _LEAST_SHARE * len(seen)):
+        T_map_base, limits = T_map_odom @ T_odom_base, self._limits
+        samples = samples_of(seen, np.tile(planes.T_base_sensor.t, (len(seen), 1)))
+        (score,) = KnownOutlines(known).scores(
+            samples,
+            T_map_base.matrix[None],
+            angle_rad=limits.angle_rad,
+            distance_m=limits.distance_m,
+        )
+        pairs = matches(known, seen, T_map_base, limits)
+        if score < limits.min_score or not len(pairs):
             return 0
-        self._correct(stamp_ns, known, seen, pairs, T_map_odom @ T_odom_base, T_odom_base)
+        self._correct(planes.stamp_ns, known, seen, pairs, T_map_base, T_odom_base)
         return len(pairs)
 
     def _search(self, stamp_ns: int, T_odom_base: SE3) -> tuple[int, str]:
