@@ -14,6 +14,7 @@ from mapstream.operators.lidar.images.grid import GridConfig, ScanGrid
 from mapstream.operators.lidar.images.lidar_image import LidarImage, LidarImageConfig
 from mapstream.operators.lidar.images.lidar_keypoints import LidarKeypoints, LidarKeypointsConfig
 from mapstream.operators.lidar.images.lidar_tracks import LidarTracks, LidarTracksConfig
+from mapstream.operators.networks.network_tracker import NetworkTracker, NetworkTrackerConfig
 from mapstream.operators.operator import Context, set_context
 from mapstream.operators.places.geometry.consensus import ConsensusConfig, find_pose
 from mapstream.operators.places.geometry.sightings import make_sightings
@@ -96,6 +97,24 @@ def test_D17_any_detector_and_any_network_will_do(
     assert len(found) > 20
     assert found.descriptors.shape[0] == len(found)
     assert found.points_m is not None
+
+
+@pytest.mark.slow
+def test_D17_a_network_matches_keypoints_of_lidar_images(drive: Drive) -> None:
+    """XFeat and LighterGlue in the place of SuperPoint and SuperGlue: most matches are of one point."""
+    installed("xfeat")
+    installed("lighterglue")
+    finder, tracker = keypoints("xfeat"), NetworkTracker(NetworkTrackerConfig())
+    found = [tracker.track(finder.detect(scan)) for scan in drive.scans[:2]]
+
+    a, b = (np.asarray(features.track_ids) for features in found)
+    _, before, now = np.intersect1d(a, b, return_indices=True)
+    map_ = mapped(drive, [[each] for each in found] + [[]] * (len(drive.scans) - 2))
+    points = views_of(map_, np.arange(len(map_.observations))).points
+    apart_m = np.linalg.norm(points[before] - points[len(a) + now], axis=1)
+
+    assert len(before) > 30
+    assert np.mean(apart_m < 0.5) > 0.6
 
 
 def test_D17_keypoints_do_not_end_at_the_seam(drive: Drive) -> None:
