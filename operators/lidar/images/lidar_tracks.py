@@ -12,6 +12,7 @@ from typing import ClassVar, NamedTuple
 import numpy as np
 from pydantic import Field, NonNegativeInt, PositiveFloat
 
+from mapstream.operators.networks.matchers import Matcher, make_matcher
 from mapstream.operators.operator import Operator, Placement, offload, warn
 from mapstream.operators.places.geometry.consensus import ConsensusConfig, find_pose
 from mapstream.operators.places.geometry.sightings import Sensor, Sightings, make_sightings
@@ -48,6 +49,10 @@ class LidarTracksConfig(MatchRules):
     """So many scans in a row may miss a keypoint before its track ends."""
     max_apart_s: PositiveFloat = 0.001
     """So far the odometry's stamp may be from that of the keypoints."""
+    matcher: str = ""
+    """A network that says what looks alike, as in `network_tracker`: lighterglue for lidar_xfeat, or an ONNX file."""
+    min_score: float = Field(default=0.1, ge=0, le=1)
+    """Matches that the network is less sure of do not count."""
     consensus: ConsensusConfig = Field(default_factory=ConsensusConfig)
     """When keypoints agree on a motion, where no odometry tells it."""
 
@@ -78,7 +83,8 @@ class LidarTracks(Operator[Inputs, Outputs]):
 
     def __init__(self, config: LidarTracksConfig) -> None:
         self._config = config
-        self._tracks = _NearTracks(config)
+        self._alike = _Alike(config)
+        self._tracks = _NearTracks(config, self._alike)
         self._pose: tuple[int, SE3] | None = None  # T_odom_base and its stamp, of the scan before
         self._step: tuple[int, SE3] | None = None  # since the scan before that, and its duration
         self._known: ImageFeatures | None = None  # of the scan before, in the odom frame
@@ -133,7 +139,7 @@ class LidarTracks(Operator[Inputs, Outputs]):
         known = self._known
         if known is None or self._pose is None:
             return SE3.identity()
-        pairs = matched(known.descriptors, features.descriptors, self._config)
+        pairs = self._alike.of_all(known, features)
         sightings = self._sightings(known, features, pairs)
         try:
             found = find_pose(sightings, self._config.consensus, features.stamp_ns)
@@ -160,12 +166,39 @@ class LidarTracks(Operator[Inputs, Outputs]):
         )
 
 
+class _Alike:
+    """Says which keypoints look alike: a network, or descriptors."""
+
+    def __init__(self, config: LidarTracksConfig) -> None:
+        self._config = config
+        self._network: Matcher | None = None
+
+    def of_all(self, before: ImageFeatures, now: ImageFeatures) -> IntArray:
+        """Return which rows (K, 2) of all are alike."""
+        if self._config.matcher:
+            return self._matched(before, now)
+        return matched(before.descriptors, now.descriptors, self._config)
+
+    def of_pairs(self, before: ImageFeatures, now: ImageFeatures, pairs: IntArray) -> IntArray:
+        """Return which of some pairs of rows (C, 2) are alike, (K, 2)."""
+        if self._config.matcher:
+            found, width = self._matched(before, now), len(now)
+            return found[np.isin(found @ [width, 1], pairs @ [width, 1])]
+        difference = differences(before.descriptors, now.descriptors, pairs)
+        return one_to_one(pairs, difference, self._config, before.descriptors)
+
+    def _matched(self, before: ImageFeatures, now: ImageFeatures) -> IntArray:
+        if self._network is None:
+            self._network = make_matcher(self._config.matcher, self._config.min_score)
+        return self._network.match(before, now)
+
+
 class _NearTracks(MatchedTracks):
     """Tracks of keypoints whose points are in a frame that stands still."""
 
-    def __init__(self, config: LidarTracksConfig) -> None:
+    def __init__(self, config: LidarTracksConfig, alike: _Alike) -> None:
         super().__init__(MatchedTracksConfig(max_missed=config.max_missed))
-        self._config = config
+        self._config, self._alike = config, alike
         self._places: dict[int, _Place] = {}  # by track
 
     def candidates(
@@ -188,8 +221,7 @@ class _NearTracks(MatchedTracks):
         )
         near = near[near["v"] <= reach_m[near["j"]]]
         pairs = np.stack([near["i"], near["j"]], axis=1).astype(np.int64)
-        difference = differences(before.descriptors, now.descriptors, pairs)
-        return one_to_one(pairs, difference, self._config, before.descriptors)
+        return self._alike.of_pairs(before, now, pairs)
 
     def follow(self, features: ImageFeatures) -> ImageFeatures:
         """Return the keypoints of the next scan with their track ids."""
