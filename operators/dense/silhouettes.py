@@ -27,21 +27,17 @@ def least_distances_m(view: DepthView, voxel_size_m: float, truncation_m: float)
     middle = float(np.nanmedian(some)) if np.isfinite(some).any() else 0.0
     focal_px = float(view.pinhole.camera_matrix[0, 0])
     span = max(1, round(_RIM_VOXELS * voxel_size_m * focal_px * middle))
-    span = min(span, min(inverse.shape) // 4)
+    span = min(span, max(1, min(inverse.shape) // 4))
     bend = np.float32(truncation_m) * inverse * inverse  # a step in depth as long as the truncation
-    is_rim = _is_convex(inverse, 0, span, bend) | _is_convex(inverse, 1, span, bend)
+    is_rim = np.zeros(inverse.shape, np.bool_)
+    _mark_convex(is_rim, inverse, bend, span)
+    _mark_convex(is_rim.T, inverse.T, bend.T, span)
     near = np.float32(-_BEHIND_VOXELS * voxel_size_m)
     return np.where(is_rim, near, np.float32(-truncation_m))
 
 
-def _is_convex(inverse: Float32Array, axis: int, span: int, bend: Float32Array) -> BoolArray:
-    """Return which pixels stand out from those a span before and after, or from one of them."""
-    padding = [(span, span) if a == axis else (0, 0) for a in range(2)]
-    padded = np.pad(inverse, padding, mode="edge")
-    count = inverse.shape[axis]
-    before, after = (
-        padded[tuple(slice(s, s + count) if a == axis else slice(None) for a in range(2))]
-        for s in (0, 2 * span)
-    )
-    stands_out: BoolArray = 2 * inverse - before - after > bend  # false where one is NaN
-    return stands_out
+def _mark_convex(is_rim: BoolArray, inverse: Float32Array, bend: Float32Array, span: int) -> None:
+    """Mark the pixels that stand out from those a span before and after in their column, or from one of them."""
+    inside = slice(span, -span)
+    outside = 2 * inverse[inside] - inverse[: -2 * span] - inverse[2 * span :]
+    is_rim[inside] |= outside > bend[inside]  # false where one is NaN
