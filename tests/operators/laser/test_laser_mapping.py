@@ -35,7 +35,7 @@ SECOND_NS = 10**9
 @cache
 def recording() -> dict[str, list[Any]]:
     """Return the messages of a small W-2D by topic."""
-    laser = PlanarLaserConfig(beams=271, rate_hz=4)
+    laser = PlanarLaserConfig(beams=181, rate_hz=4)
     topics: dict[str, list[Any]] = {}
     for record in w_2d(W2dConfig(width_m=14.0, visits=False, laser=laser), seed=1).records:
         topics.setdefault(record.topic, []).append(record.message)
@@ -69,11 +69,11 @@ async def test_I15_two_laps_close_with_scans_alone() -> None:
     topics = recording()
     submaps = await submaps_of({"laser": topics["/scan"], "wheels": []})
 
-    maps = await map_of(submaps, LOOPS, LaserLoops(LaserLoopsConfig()))
+    maps = await map_of(submaps, LOOPS, LaserLoops(LaserLoopsConfig(spacing_m=3.0)))
 
     edges = maps[-1].edges
     loops = np.flatnonzero(edges.kind == "loop")
-    assert len(loops) >= 10
+    assert len(loops) >= 5
     assert (edges.switch[loops] >= 0.5).all()
     assert (np.abs(edges.vertex_b[loops] - edges.vertex_a[loops]) > 20).all()
     assert errors_m(maps[-1], truth()).max() < 0.05
