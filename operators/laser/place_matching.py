@@ -17,9 +17,7 @@ from mapstream.streams.errors import EstimationError
 from mapstream.streams.geometry import SE3
 
 _MIN_POINTS = 30
-_MAX_SIGMA_M = (
-    0.3  # of the position along an axis: more is a corridor that says not where in it one is
-)
+_MAX_SIGMA_M = 0.3  # of the position along an axis; a corridor does not say where in it one is
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,9 +28,7 @@ class PlanarMatcher:
     """
 
     turn_rad: float  # how far from the guess to look
-    overlap_radius_m: (
-        float  # only points so near the robot must fit: those both times were in sight
-    )
+    overlap_radius_m: float  # only points so near the robot must fit: both times they were in sight
     cell_m: float  # one point is taken in each
     config: MatchConfig
     ground_sigma_rad: float  # of roll and pitch, which a planar laser does not see

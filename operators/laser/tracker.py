@@ -38,9 +38,7 @@ class TrackerConfig:
     max_lost_scans: int
     wheels: FloatArray  # (3,) deviation of yaw, x, y after a metre of way
     turn_m_per_rad: float  # the way that a turn on the spot counts for
-    accelerations: (
-        FloatArray  # (3,) of yaw, x, y: without wheels, velocity changes by so much in a second
-    )
+    accelerations: FloatArray  # (3,) of yaw, x, y: so much, where there are no wheels
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
