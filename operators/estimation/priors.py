@@ -1,6 +1,7 @@
 """Weak priors on what measurements alone may leave open, so that a problem never has too few of them.
 
-Biases begin near zero, extrinsics near where they were measured, outer frames anywhere.
+Biases begin near zero, extrinsics near where they were measured, outer frames anywhere, and walls that were seen
+as lines stand upright to the laser that saw them.
 Each is so weak that a handful of measurements outweighs it.
 """
 
@@ -13,12 +14,14 @@ import numpy as np
 
 from mapstream.operators.estimation.factors.inertial import parameters_of
 from mapstream.operators.estimation.factors.mounts import mounts, place_prior
+from mapstream.operators.estimation.factors.planes import coefficients
 from mapstream.operators.estimation.keys import key_of, rows_by_variable
 from mapstream.operators.estimation.noise import Factor
 from mapstream.operators.estimation.outer_frames import starting_frames
 from mapstream.recordings.maps.model import Map
 from mapstream.streams.arrays import IntArray
 
+_TILT_SIGMA_RAD = 0.3  # of a wall
 _FRAME_SIGMAS = np.repeat([10.0, 1e5], 3)  # [rad, m]
 
 
@@ -34,6 +37,7 @@ def prior_factors(map_: Map, factors: Mapping[int, Factor]) -> dict[int, Factor]
         **_of_biases(map_, rows.get("bias", nothing)),
         **_of_mounts(map_, rows.get("extrinsics", nothing)),
         **_of_frames(map_, rows.get("frame", nothing)),
+        **_of_walls(map_, np.array(sorted(factors), np.int64)),
     }
 
 
@@ -67,4 +71,17 @@ def _of_frames(map_: Map, rows: IntArray) -> dict[int, Factor]:
     return {
         key: gtsam.PriorFactorPose3(key, gtsam.Pose3(start), noise)
         for key, start in zip(keys, starts, strict=True)
+    }
+
+
+def _of_walls(map_: Map, rows: IntArray) -> dict[int, Factor]:
+    """Return priors on the tilt of planes that edges see as lines, which leave it open."""
+    noise = gtsam.noiseModel.Isotropic.Sigma(2, _TILT_SIGMA_RAD)
+    edges = map_.edges
+    is_line = (edges.kind[rows] == "plane") & np.isinf(edges.covariance[rows, 0, 0])
+    walls = np.unique(edges.landmark_a[rows[is_line]])
+    known = coefficients(map_.T_map_landmark(walls))
+    return {
+        (key := key_of("landmark", row)): gtsam.OrientedPlane3DirectionPrior(key, plane, noise)
+        for row, plane in zip(walls.tolist(), known, strict=True)
     }
