@@ -46,7 +46,6 @@ TOOLS = {
     "register": "mapstream.operators.lidar.constraints.register:register",
     "remove_bad_landmarks": "mapstream.operators.landmarks.removal:remove_bad_landmarks",
     "remove_invalid_observations": "mapstream.operators.landmarks.removal:remove_invalid_observations",
-    "remove_moving": "mapstream.operators.dense.moving:remove_moving",
     "reset_quality": "mapstream.operators.landmarks.quality:reset_quality",
     "retriangulate": "mapstream.operators.landmarks.create:retriangulate",
     "summarize": "mapstream.operators.places.summary:summarize",
