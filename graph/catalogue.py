@@ -46,6 +46,7 @@ BUILT_IN = {
     "gnss": "mapstream.operators.gnss.positions:Gnss",
     "gray": "mapstream.operators.images.gray:Gray",
     "grid_localization": "mapstream.operators.laser.grid_localization:GridLocalization",
+    "grid_sink": "mapstream.operators.sinks.grid:GridSink",
     "image_decode": "mapstream.operators.decode.image:ImageDecode",
     "imu_biases": "mapstream.operators.imu.biases:ImuBiases",
     "keyframes": "mapstream.operators.submaps.keyframes:Keyframes",

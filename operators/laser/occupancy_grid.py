@@ -1,4 +1,4 @@
-"""The occupancy grid of a map while it grows, and as a file of the finished one."""
+"""The occupancy grid of a map while it grows."""
 
 from __future__ import annotations
 
@@ -6,32 +6,20 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 import anyio
-from pydantic import Field
 
 from mapstream.operators.laser.map_grid import GridConfig, map_grid
 from mapstream.operators.maps.passing_clouds import PassingClouds
 from mapstream.operators.operator import (
     Operator,
-    OptionalPath,
     Placement,
     offload,
-    report_written,
     warn,
 )
-from mapstream.recordings.grid_files import write_grid
 from mapstream.recordings.maps.model import Map
 from mapstream.streams.channel import Receiver, Sender
 from mapstream.streams.errors import MapError
 from mapstream.streams.messages.estimates import Submap
 from mapstream.streams.messages.grids import OccupancyGrid
-
-
-class OccupancyGridConfig(GridConfig):
-    """Options of `occupancy_grid`."""
-
-    path: OptionalPath = Field(
-        default=None, description="a YAML file, which is written anew with each map"
-    )
 
 
 @dataclass(frozen=True)
@@ -53,7 +41,7 @@ class OccupancyGrids(Operator[Inputs, Outputs]):
     placement: ClassVar[Placement] = "thread"
     spans_epochs: ClassVar[bool] = True
 
-    def __init__(self, config: OccupancyGridConfig) -> None:
+    def __init__(self, config: GridConfig) -> None:
         self._config = config
 
     async def run(self, inputs: Inputs, outputs: Outputs) -> None:
@@ -71,8 +59,6 @@ class OccupancyGrids(Operator[Inputs, Outputs]):
                         warn(f"a map without a grid: {error}")
                         continue
                     await outputs.grids.send(grid)
-                    if self._config.path is not None:
-                        report_written(self._config.path)
 
     async def _keep(self, submaps: Receiver[Submap], clouds: PassingClouds) -> None:
         async for submap in submaps:
@@ -81,13 +67,9 @@ class OccupancyGrids(Operator[Inputs, Outputs]):
         clouds.end()
 
     def drawn(self, map_: Map, clouds: PassingClouds) -> OccupancyGrid:
-        """Return the grid of a map, and write it where the config says so.
+        """Return the grid of a map.
 
         Raises:
             MapError: If the map has no clouds, or the grid would be too large.
-            RecordingError: If the file cannot be written.
         """
-        grid, _ = map_grid(clouds.put_into(map_), clouds.folder, self._config)
-        if self._config.path is not None:
-            write_grid(self._config.path, grid)
-        return grid
+        return map_grid(clouds.put_into(map_), clouds.folder, self._config)[0]

@@ -13,7 +13,8 @@ import pytest
 from mapstream.operators.laser.beams import beam_ends
 from mapstream.operators.laser.floor import open_floor
 from mapstream.operators.laser.map_grid import GridConfig, map_grid
-from mapstream.operators.laser.occupancy_grid import OccupancyGridConfig, OccupancyGrids
+from mapstream.operators.laser.occupancy_grid import OccupancyGrids
+from mapstream.operators.sinks.grid import GridSink, GridSinkConfig
 from mapstream.operators.sinks.map_store import MapStore, MapStoreConfig
 from mapstream.operators.submaps.keyframes import Keyframes, KeyframesConfig
 from mapstream.operators.submaps.submap_builder import SubmapBuilder, SubmapBuilderConfig
@@ -83,9 +84,10 @@ def right_share(grid: OccupancyGrid) -> float:
 async def test_N11_a_map_that_grows_has_a_grid(drive: Drive, tmp_path: Path) -> None:
     """The last of its grids is that of the file, and what it calls free is free."""
     path = tmp_path / "plan.yaml"
-    config = OccupancyGridConfig.model_validate(CONFIG | {"path": path})
+    operator = OccupancyGrids(GridConfig.model_validate(CONFIG))
 
-    out = await run_operator(OccupancyGrids(config), maps=drive.maps[-1:], submaps=drive.submaps)
+    out = await run_operator(operator, maps=drive.maps[-1:], submaps=drive.submaps)
+    await run_operator(GridSink(GridSinkConfig(path=path)), grids=out["grids"])
 
     (grid,) = out["grids"]
     assert right_share(grid) > 0.995
