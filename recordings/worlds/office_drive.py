@@ -115,9 +115,10 @@ def _reversed(stations: FloatArray) -> FloatArray:
 
 
 def _smoothed(values: FloatArray, sigma_m: float) -> FloatArray:
-    """Return values along the way (N,) with a Gaussian over their neighbours; both ends stay."""
+    """Return values along the way (N,) with a Gaussian over their neighbours; the first one stays."""
     reach = round(4 * sigma_m / _STEP_M)
     kernel = np.exp(-0.5 * (np.arange(-reach, reach + 1) * _STEP_M / sigma_m) ** 2)
-    padded = np.pad(values, reach, mode="edge")
+    padded = np.pad(values, (reach, 0), mode="reflect", reflect_type="odd")
+    padded = np.pad(padded, (0, reach), mode="edge")
     smooth: FloatArray = np.convolve(padded, kernel / kernel.sum(), mode="valid")
     return smooth

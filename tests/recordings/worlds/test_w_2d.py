@@ -82,6 +82,11 @@ def test_A6_beams_end_on_the_walls_once_their_motion_is_undone(messages: list[An
         assert floor.is_solid(ends + step).mean() > 0.9  # corners are grazed
 
 
+def test_a_drive_starts_at_the_origin_of_the_plan(messages: list[Any]) -> None:
+    """So maps are in the frame of the truth."""
+    np.testing.assert_allclose(truth_of(messages).poses[0], np.eye(4), atol=1e-9)
+
+
 def test_the_plan_is_in_the_recording(messages: list[Any]) -> None:
     (plan,) = of_type(messages, OccupancyGrid)
     counts = {value: int((plan.cells == value).sum()) for value in (FREE, OCCUPIED, UNKNOWN)}
