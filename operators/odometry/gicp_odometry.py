@@ -6,7 +6,7 @@ LiDAR Odometry, RA-L 2022, section III-D.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import numpy as np
@@ -23,11 +23,7 @@ from mapstream.operators.odometry.local_map import LocalMap
 from mapstream.operators.odometry.resolution import Resolution
 from mapstream.operators.odometry.scan_matcher import ScanMatcher
 from mapstream.operators.odometry.scan_motion import Sweep, is_plausible
-from mapstream.operators.odometry.uncertainty import (
-    as_predicted_along,
-    open_directions,
-    unmeasured,
-)
+from mapstream.operators.odometry.uncertainty import unmeasured
 from mapstream.operators.operator import Operator, OperatorConfig, Placement, offload, warn
 from mapstream.streams.arrays import FloatArray
 from mapstream.streams.channel import Receiver, Sender
@@ -90,8 +86,8 @@ class GicpOdometry(Operator[Inputs, Outputs]):
     other headings at a coarse resolution. If that fails too the step is reported: `is_lost`, the predicted
     pose, the covariance of no measurement, and a warning with its stamp.
     The covariance of a good step is that of the registration: its Hessian scaled by the residual. A direction
-    that the surroundings do not hold, such as a blank corridor's axis, goes on as predicted and has
-    `UNOBSERVED_VARIANCE`, so that another sensor may take it.
+    that the surroundings do not hold, such as a blank corridor's axis, has `UNOBSERVED_VARIANCE`, so that
+    another sensor may take it; the pose is the registration's, which moves along it by what it makes of noise.
     """
 
     placement: ClassVar[Placement] = "process"  # small_gicp holds the GIL
@@ -182,9 +178,7 @@ class GicpOdometry(Operator[Inputs, Outputs]):
             raise EstimationError(
                 f"a jump of {np.linalg.norm(moved.t):.2f} m and {angle_deg:.1f} deg"
             )
-        unseen = open_directions(result.covariance)
-        T = as_predicted_along(unseen, T_last @ step, result.T_target_source)
-        return replace(result, T_target_source=T)
+        return result
 
     def _finish(
         self,

@@ -78,7 +78,7 @@ class KissOdometry(Operator[Inputs, Outputs]):
     reported: `is_lost`, the predicted pose, the covariance of no measurement, and a warning with its stamp.
     The covariance of a good step is constant, or grows with the adaptive threshold, by which KISS-ICP
     measures how far its prediction is off. A direction that the scan's surfaces do not hold, such as a blank
-    corridor's axis, goes on as predicted and has `UNOBSERVED_VARIANCE`, so that another sensor may take it.
+    corridor's axis, has `UNOBSERVED_VARIANCE`, so that another sensor may take it; the pose is KISS-ICP's own.
     In narrow places point-to-point ICP locks to the rings of the scan; `gicp_odometry` does not.
     """
 

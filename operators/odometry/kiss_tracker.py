@@ -11,7 +11,6 @@ from kiss_icp.kiss_icp import KissICP
 from mapstream.operators.lidar.scan_shape import open_directions_of_scan
 from mapstream.operators.odometry.recent_voxels import RecentVoxels
 from mapstream.operators.odometry.scan_motion import Sweep, is_plausible
-from mapstream.operators.odometry.uncertainty import as_predicted_along
 from mapstream.streams.arrays import FloatArray
 from mapstream.streams.errors import EstimationError
 from mapstream.streams.geometry import SE3
@@ -84,7 +83,6 @@ class KissTracker:
             kernel=sigma,
         )
         self.unseen = open_directions_of_scan(frame_downsample)
-        pose = as_predicted_along(self.unseen, SE3(predicted), SE3(pose)).matrix
         moved = SE3(pose) @ source
         if self.has_map:
             try:

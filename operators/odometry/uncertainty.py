@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from mapstream.streams.arrays import BoolArray, FloatArray
-from mapstream.streams.geometry import SE3, straightened, symmetric
+from mapstream.streams.geometry import SE3, symmetric
 from mapstream.streams.messages.estimates import UNOBSERVED_VARIANCE
 
 OPEN_VARIANCE = (
@@ -87,16 +87,3 @@ def bridged(covariance: FloatArray, duration_s: float) -> FloatArray:
     closed = np.eye(len(covariance)) - directions.T @ directions
     along = directions.T @ directions @ unmeasured(duration_s) @ directions.T @ directions
     return symmetric(closed @ finite @ closed + along)
-
-
-def as_predicted_along(directions: FloatArray, T_predicted: SE3, T_measured: SE3) -> SE3:
-    """Return a measured pose that is the predicted one along some directions (K, 6), tangent at the latter.
-
-    Source: Zhang, Kaess, Singh, On degeneracy of optimization-based state estimation problems, ICRA 2016,
-    section IV (solution remapping).
-    """
-    if not len(directions):
-        return T_measured
-    step = (T_predicted.inverse() @ T_measured).log()
-    T = T_predicted @ SE3.exp(step - directions.T @ (directions @ step))
-    return SE3(straightened(T.matrix))  # predictions would carry rounding on from scan to scan
