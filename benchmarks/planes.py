@@ -77,7 +77,8 @@ def _angle_deg(shot: Shot, normals: FloatArray) -> FloatArray:
     surfaces = shot.surfaces.astype(np.float32)
     inside = (cv2.erode(surfaces, kernel) == cv2.dilate(surfaces, kernel)) & (shot.depth.image > 0)
     cosine = np.abs(np.einsum("ij,ij->i", normals[inside], shot.normals[inside]))
-    return np.rad2deg(np.arccos(np.clip(np.nan_to_num(cosine), 0, 1)))
+    angles: FloatArray = np.rad2deg(np.arccos(np.clip(np.nan_to_num(cosine), 0, 1)))
+    return angles
 
 
 def _of_planes(operator: PlaneSegmentation, shot: Shot) -> FloatArray:
@@ -105,7 +106,9 @@ def run() -> list[Row]:
         other_s = _seconds(lambda shot, n=normals: n.apply(_points(shot.depth)), shots)  # type: ignore[misc]  # bound now
         other_deg = np.concatenate(
             [
-                _angle_deg(shot, np.asarray(normals.apply(_points(shot.depth)))[..., :3])
+                _angle_deg(
+                    shot, np.asarray(normals.apply(_points(shot.depth)), np.float64)[..., :3]
+                )
                 for shot in shots
             ]
         )

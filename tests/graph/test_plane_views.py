@@ -31,7 +31,7 @@ def test_P1_planes_and_wall_lines_are_drawn_within_their_outlines(tmp_path: Path
         T_base_plane=np.empty((0, 4, 4)),
         covariances=np.empty((0, 6, 6)),
         hulls_m=(),
-        num_points=np.empty(0),
+        num_points=np.empty(0, np.int64),
         rmse_m=np.empty(0),
     )
 

@@ -177,7 +177,7 @@ def one_of_each(seed: int) -> list[Any]:
             T_mission_odom=pose(), T_map_mission=maybe(pose()),
         ),
         OccupancyGrid(
-            stamp_ns=stamp, cells=rng.integers(-1, 101, (n, 3)), resolution_m=0.05, T_map_grid=pose()
+            stamp_ns=stamp, cells=rng.integers(-1, 101, (n, 3), np.int8), resolution_m=0.05, T_map_grid=pose()
         ),
         PlaneSegments(
             stamp_ns=stamp, T_base_plane=np.array([pose().matrix for _ in range(n)]).reshape(n, 4, 4),
