@@ -57,7 +57,7 @@ class FloorConfig(OperatorConfig):
     """The same of the turn."""
     gather_scans: PositiveInt = 8
     """At most."""
-    least_way_m: NonNegativeFloat = 0.5
+    least_way_m: NonNegativeFloat = 1.0
     """Way of these scans before they are searched for, for places look alike from one point."""
     drift: DriftConfig = Field(
         default_factory=lambda: DriftConfig(
