@@ -21,6 +21,7 @@ from mapstream.streams.arrays import FloatArray
 _STEP = 2  # every so many rows and columns are compared
 _MOST_CHI2 = 2.0  # of a window that is flat
 _SEED = 0.25  # of the pixels of a plane are there before it grows
+_LEAST_TOLD = 20  # flat places that tell the plane of a region
 _NUM_SIGMAS = 3.0  # that a pixel may lie off its plane
 
 
@@ -45,7 +46,10 @@ def depth_planes(grid: DepthGrid, limits: SegmentationLimits) -> tuple[ImagePlan
     grown = same_label_regions(_nearest(grid, surfaces, limits.distance_m), surface_of[seeds])
     labels, count = _largest_first(grown, limits.min_pixels)
     sizes = np.bincount(labels.ravel(), minlength=count + 1)[1:]
-    inside = np.where(seeds > 0, labels[::_STEP, ::_STEP], 0)  # where windows were flat
+    near = labels[::_STEP, ::_STEP]
+    inside = np.where(seeds > 0, near, 0)  # where windows were flat
+    is_told = np.bincount(inside.ravel(), minlength=count + 1) >= _LEAST_TOLD
+    inside = np.where(is_told[near], inside, near)  # nowhere flat enough: by all that lies on it
     return replace(fitted(coarse, inside, count), num_pixels=sizes.astype(np.int64)), labels
 
 

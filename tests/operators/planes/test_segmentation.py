@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cache
+from itertools import islice
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from mapstream.operators.planes.plane_segmentation import (
 )
 from mapstream.operators.testing import run_operator
 from mapstream.recordings.worlds.orbit import orbit
+from mapstream.recordings.worlds.w_2d import W2dConfig, w_2d
 from mapstream.recordings.worlds.w_rgbd import (
     START_NS,
     T_BASE_CAMERA,
@@ -181,3 +183,23 @@ def test_an_image_without_planes_has_none_and_one_without_calibration_is_refused
     assert not labels.image.any()
     with pytest.raises(OperatorError, match="has no calibration"):
         operator.segment(empty)
+
+
+def test_a_wall_of_which_hardly_a_spot_is_flat_enough_is_a_plane_too() -> None:
+    """Fewer than three flat spots made a system of equations without a solution."""
+    robot = {
+        "width_m": 14.0,
+        "laps": 0.25,
+        "wheels_hz": 1.0,
+        "laser": {"rate_hz": 0.5},
+        "depth": {"columns": 160, "rows": 120, "rate_hz": 2.0},
+    }
+    records = w_2d(W2dConfig.model_validate(robot), 0).records
+    frames = (r.message for r in records if isinstance(r.message, CameraFrame))
+    frame = next(islice(frames, 20, None))
+
+    config = PlaneSegmentationConfig(min_pixels=700, window_px=7)
+    planes, labels = PlaneSegmentation(config).segment(frame)
+
+    assert len(planes) == labels.image.max() > 2
+    assert np.isfinite(planes.T_base_plane).all()
