@@ -10,11 +10,12 @@ from pydantic import PositiveFloat
 
 from mapstream.operators.laser.odds_grid import OddsConfig, OddsGrid
 from mapstream.operators.laser.sight import rays_of
+from mapstream.operators.maps.aggregate import placed_cloud_rows
 from mapstream.recordings.cloud_store import read_cloud
 from mapstream.recordings.maps.model import Map
 from mapstream.recordings.maps.records import recorded
 from mapstream.streams.arrays import FloatArray, IntArray
-from mapstream.streams.errors import DecodeError, MapError, RecordingError
+from mapstream.streams.errors import DecodeError, RecordingError
 from mapstream.streams.geometry import SE3
 from mapstream.streams.messages.grids import FREE, UNKNOWN, OccupancyGrid
 
@@ -67,7 +68,7 @@ def map_grid(
         MapError: If the map has no clouds, one is missing, or the grid would be too large.
     """
     config = config or GridConfig()
-    rows = _clouds(map_, folder, with_unanchored=config.with_unanchored)
+    rows = placed_cloud_rows(map_, folder, with_unanchored=config.with_unanchored)
     vertices = map_.resources.vertex[rows]
     origins = None if config.sensor_xyz_m else _recorded_origins(map_, vertices)
     given = np.array(config.sensor_xyz_m or (0.0, 0.0, 0.0))
@@ -87,18 +88,6 @@ def map_grid(
         occupied_cells=int(((grid.cells >= 50) & (grid.cells != UNKNOWN)).sum()),
         knows_sensors=origins is not None or config.sensor_xyz_m is not None,
     )
-
-
-def _clouds(map_: Map, folder: Path, *, with_unanchored: bool) -> IntArray:
-    """Return the resources that are clouds of missions whose place is known."""
-    resources = map_.resources
-    rows = np.flatnonzero((resources.kind == "cloud") & (resources.topic == ""))
-    mission = map_.vertices.mission[resources.vertex[rows]]
-    chosen = rows[map_.missions.is_base_frame_known[mission] | with_unanchored]
-    if not len(chosen):
-        reason = "of missions whose place is known" if len(rows) else "at all"
-        raise MapError(f"{folder}: there are no clouds {reason}, so there is no grid")
-    return chosen
 
 
 def _recorded_origins(map_: Map, vertices: IntArray) -> FloatArray | None:

@@ -12,7 +12,7 @@ from mapstream.operators.maps.voxels import Voxels
 from mapstream.operators.operator import OperatorConfig
 from mapstream.recordings.cloud_store import read_cloud
 from mapstream.recordings.maps.model import Map
-from mapstream.streams.arrays import FloatArray
+from mapstream.streams.arrays import FloatArray, IntArray
 from mapstream.streams.errors import MapError
 from mapstream.streams.messages.estimates import PointCloud
 
@@ -57,6 +57,19 @@ def placed_clouds(
     Raises:
         MapError: If the map has no clouds, or one is missing.
     """
+    rows = placed_cloud_rows(map_, folder, with_unanchored=with_unanchored)
+    poses = map_.T_map_base(map_.resources.vertex[rows])
+    for row, T_map_base in zip(rows.tolist(), poses, strict=True):
+        cloud = read_cloud(folder / map_.resources.path[row])
+        yield cloud.points.astype(np.float64) @ T_map_base[:3, :3].T + T_map_base[:3, 3], cloud
+
+
+def placed_cloud_rows(map_: Map, folder: Path, *, with_unanchored: bool = False) -> IntArray:
+    """Return the resources that are clouds of missions whose place is known, or of all missions.
+
+    Raises:
+        MapError: If there are none.
+    """
     resources = map_.resources
     rows = np.flatnonzero((resources.kind == "cloud") & (resources.topic == ""))
     mission = map_.vertices.mission[resources.vertex[rows]]
@@ -64,7 +77,4 @@ def placed_clouds(
     if not len(chosen):
         reason = "of missions whose place is known" if len(rows) else "at all"
         raise MapError(f"{folder}: there are no clouds {reason}; connect submaps to the map_store")
-    poses = map_.T_map_base(resources.vertex[chosen])
-    for row, T_map_base in zip(chosen.tolist(), poses, strict=True):
-        cloud = read_cloud(folder / resources.path[row])
-        yield cloud.points.astype(np.float64) @ T_map_base[:3, :3].T + T_map_base[:3, 3], cloud
+    return chosen

@@ -8,7 +8,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 
 from mapstream.operators.maps.aggregate import AggregateConfig, aggregate_cloud
 from mapstream.operators.maps.colmap import colmap_model
@@ -25,7 +24,7 @@ from mapstream.recordings.trajectory_files import write_euroc, write_kitti, writ
 from mapstream.streams.arrays import IntArray
 from mapstream.streams.errors import MapError
 from mapstream.streams.geometry import SE3
-from mapstream.streams.messages.estimates import Odometry, PointCloud, RelativePose
+from mapstream.streams.messages.estimates import Odometry, RelativePose
 from mapstream.streams.trajectory import Trajectory
 
 
@@ -114,28 +113,23 @@ def _colmap(map_: Map, folder: Path, path: Path, config: ExportConfig) -> Export
 
 def _ply(map_: Map, folder: Path, path: Path, config: ExportConfig) -> ExportReport:
     cloud = aggregate_cloud(map_, folder, config)
-    write_ply(path, cloud.points, cloud.intensity, _colors(cloud))
+    write_ply(path, cloud.points, cloud.intensity, cloud.colors_rgb)
     return ExportReport(files=(path,), written={"points": len(cloud.points)})
 
 
 def _pcd(map_: Map, folder: Path, path: Path, config: ExportConfig) -> ExportReport:
     cloud = aggregate_cloud(map_, folder, config)
-    write_pcd(path, cloud.points, cloud.intensity, _colors(cloud))
+    write_pcd(path, cloud.points, cloud.intensity, cloud.colors_rgb)
     return ExportReport(files=(path,), written={"points": len(cloud.points)})
 
 
 def _las(map_: Map, folder: Path, path: Path, config: ExportConfig) -> ExportReport:
     cloud = aggregate_cloud(map_, folder, config)
     placed = georeferenced(map_, cloud.points.astype(np.float64), config.crs)
-    write_las(path, placed.points, cloud.intensity, _colors(cloud), placed.wkt)
+    write_las(path, placed.points, cloud.intensity, cloud.colors_rgb, placed.wkt)
     return ExportReport(
         files=(path,), written={f"points in {placed.crs or 'the map frame'}": len(cloud.points)}
     )
-
-
-def _colors(cloud: PointCloud) -> npt.NDArray[np.uint8] | None:
-    """Return red, green and blue (N, 3), black where no camera looked; None if none looked anywhere."""
-    return None if cloud.colors_rgba is None else cloud.colors_rgba[:, :3]
 
 
 def _mcap(map_: Map, folder: Path, path: Path, config: ExportConfig) -> ExportReport:  # noqa: ARG001

@@ -5,12 +5,15 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Self
 
+import anyio
 import numpy as np
 
+from mapstream.operators.operator import offload
 from mapstream.recordings.cloud_store import CloudStore, cloud_key
 from mapstream.recordings.maps.build import add_resources
 from mapstream.recordings.maps.ids import id_bytes, vertex_id
 from mapstream.recordings.maps.model import Map
+from mapstream.streams.channel import Receiver
 from mapstream.streams.messages.estimates import Submap
 from mapstream.streams.waiting import Waiters
 
@@ -18,8 +21,9 @@ from mapstream.streams.waiting import Waiters
 class PassingClouds:
     """A temporary folder with the clouds of all submaps so far."""
 
-    def __init__(self) -> None:
-        self._store = CloudStore(max_bytes=0)
+    def __init__(self, max_bytes: int = 0) -> None:
+        """Open the folder; so many bytes of clouds stay in memory too."""
+        self._store = CloudStore(max_bytes=max_bytes)
         self._files: dict[bytes, str] = {}  # by vertex id
         self._seen: set[bytes] = set()  # vertices whose submaps came
         self._has_ended = False
@@ -30,6 +34,9 @@ class PassingClouds:
 
     def __exit__(self, *_: object) -> None:
         self._store.close()
+
+    def __len__(self) -> int:
+        return len(self._files)
 
     @property
     def folder(self) -> Path:
@@ -72,3 +79,18 @@ class PassingClouds:
         """Return the map without what `put_into` added: the store of the map keeps clouds itself."""
         own = np.isin(map_.resources.path, sorted(self._files.values()))
         return map_.select(resources=~(own & (map_.resources.kind == "cloud")))
+
+    async def gather(self, maps: Receiver[Map], submaps: Receiver[Submap] | None) -> Map | None:
+        """Keep the clouds of submaps to the end of the run; return the newest map, or None if none came."""
+        newest: Map | None = None
+
+        async def keep_clouds(submaps: Receiver[Submap]) -> None:
+            async for submap in submaps:
+                await offload(self.keep, submap)
+
+        async with anyio.create_task_group() as tasks:
+            if submaps is not None:
+                tasks.start_soon(keep_clouds, submaps)
+            async for map_ in maps:
+                newest = map_
+        return newest

@@ -6,11 +6,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar
 
-import anyio
-import numpy as np
 from pydantic import Field
 
 from mapstream.operators.dense.mesh import MeshConfig, make_mesh
+from mapstream.operators.maps.passing_clouds import PassingClouds
 from mapstream.operators.operator import (
     NoPorts,
     Operator,
@@ -20,9 +19,6 @@ from mapstream.operators.operator import (
     report_written,
     warn,
 )
-from mapstream.recordings.cloud_store import CloudStore, cloud_key
-from mapstream.recordings.maps.build import add_resources
-from mapstream.recordings.maps.ids import id_bytes, vertex_id
 from mapstream.recordings.maps.model import Map
 from mapstream.streams.channel import Receiver
 from mapstream.streams.errors import MapError
@@ -57,49 +53,19 @@ class MeshSink(Operator[Inputs, NoPorts]):
 
     def __init__(self, config: MeshSinkConfig) -> None:
         self._config = config
-        self._newest: Map | None = None
-        self._files: dict[bytes, str] = {}  # vertex id -> file in the store's folder
 
     async def run(self, inputs: Inputs, outputs: NoPorts) -> None:  # noqa: ARG002  # a sink
-        with CloudStore(max_bytes=0) as store:
-            async with anyio.create_task_group() as tasks:
-                tasks.start_soon(self._keep_newest, inputs.maps)
-                if inputs.submaps is not None:
-                    tasks.start_soon(self._keep_clouds, inputs.submaps, store)
-            if self._config.path is not None:
-                await self._finish(self._config.path, store.directory)
-
-    async def _finish(self, path: Path, folder: Path) -> None:
-        if self._newest is None:
-            warn(f"no map came, so {path} was not written")
-            return
-        try:
-            await offload(self._write, self._newest, folder, path)
-        except MapError as error:  # the map itself is whole
-            warn(f"{path} was not written: {error}")
-            return
-        report_written(path)
-
-    async def _keep_newest(self, maps: Receiver[Map]) -> None:
-        async for map_ in maps:
-            self._newest = map_
-
-    async def _keep_clouds(self, submaps: Receiver[Submap], store: CloudStore) -> None:
-        async for submap in submaps:
-            await offload(self._put, submap, store)
-
-    def _put(self, submap: Submap, store: CloudStore) -> None:
-        mission = id_bytes(submap.mission_id)
-        for keyframe in submap.keyframes if self._config.path is not None else ():
-            vertex = vertex_id(mission, keyframe.stamp_ns)
-            if keyframe.cloud is not None and vertex not in self._files:
-                key = cloud_key(submap.mission_id, keyframe.stamp_ns)
-                store.put(key, keyframe.cloud)
-                self._files[vertex] = store.path_of(key).name
-
-    def _write(self, map_: Map, folder: Path, path: Path) -> None:
-        owners = [i.tobytes() for i in map_.vertices.id]
-        rows = [row for row, vertex in enumerate(owners) if vertex in self._files]
-        paths = [self._files[owners[row]] for row in rows]
-        map_ = add_resources(map_, vertex_rows=np.array(rows, np.int64), kind="cloud", paths=paths)
-        make_mesh(map_, folder, path, self._config)
+        with PassingClouds() as clouds:
+            newest = await clouds.gather(inputs.maps, inputs.submaps)
+            path = self._config.path
+            if path is None:
+                return
+            if newest is None:
+                warn(f"no map came, so {path} was not written")
+                return
+            try:
+                await offload(make_mesh, clouds.put_into(newest), clouds.folder, path, self._config)
+            except MapError as error:  # the map itself is whole
+                warn(f"{path} was not written: {error}")
+                return
+            report_written(path)

@@ -56,6 +56,11 @@ class PointCloud:
         frozen_optional(self, "intensity", np.float32, (n,))
         frozen_optional(self, "colors_rgba", np.uint8, (n, 4))
 
+    @property
+    def colors_rgb(self) -> npt.NDArray[np.uint8] | None:
+        """The colours (N, 3), black where no camera looked; None if none looked anywhere."""
+        return None if self.colors_rgba is None else self.colors_rgba[:, :3]
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class RelativePose:
