@@ -69,7 +69,7 @@ class PlaneLandmarksConfig(OperatorConfig):
 
 @dataclass(frozen=True)
 class Outputs:
-    """One measurement for each plane seen, of kind `plane`."""
+    """One measurement for each plane seen, of kind `plane`; of each landmark, where it shows several to be one."""
 
     constraints: Sender[Constraint]
 
@@ -77,8 +77,9 @@ class Outputs:
 class PlaneLandmarks(DynamicPorts, Operator[Ports, Outputs]):
     """Recognise planes by where they are, and measure the robot's pose by them.
 
-    Lines of a planar laser and planes of a depth camera or of clouds share landmarks. Everything is decided by
-    stamps: in their order, at poses between two messages of the odometry.
+    Lines of a planar laser and planes of a depth camera or of clouds share landmarks. Where what is seen lies on two
+    landmarks, it measures both, and after that all goes to the older one. Everything is decided by stamps: in their
+    order, at poses between two messages of the odometry.
     """
 
     placement: ClassVar[Placement] = "thread"
@@ -141,7 +142,9 @@ class PlaneLandmarks(DynamicPorts, Operator[Ports, Outputs]):
             for pose, hull, line in zip(poses, planes.hulls_m, is_line, strict=True)
         ]
         names = self.known.see(planes.stamp_ns, pieces, T_mission_base, self._where.path_m)
-        return [self._constraint(planes, row, name) for row, name in enumerate(names)]
+        return [
+            self._constraint(planes, row, name) for row, same in enumerate(names) for name in same
+        ]
 
     def _constraint(self, planes: PlaneSegments, row: int, name: str) -> Constraint:
         return Constraint(

@@ -13,13 +13,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import combinations
 
-import cv2
 import numpy as np
 
 from mapstream.operators.planes.plane_evidence import KnownOutlines, samples_of
 from mapstream.operators.planes.plane_pose import PlaneNoise, PlaneSet, pose_from_planes
 from mapstream.operators.planes.seen_plane import SeenPlane
-from mapstream.recordings.maps.hulls import moved_hull
+from mapstream.recordings.maps.hulls import area_of, common_area_of, moved_hull
 from mapstream.streams.arrays import BoolArray, FloatArray, IntArray
 from mapstream.streams.geometry import SE3, invert
 
@@ -123,9 +122,8 @@ def plane_set(planes: Sequence[SeenPlane]) -> PlaneSet:
 def within(known: SeenPlane, seen: SeenPlane, T_known_seen: SE3) -> float:
     """Return what share of a plane's outline lies within that of a known one."""
     T = invert(known.T_frame_plane) @ (T_known_seen.matrix @ seen.T_frame_plane)
-    outline = moved_hull(T, seen.hull_m).astype(np.float32)
-    common, _ = cv2.intersectConvexConvex(known.hull_m.astype(np.float32), outline)
-    return float(common) / max(cv2.contourArea(outline), 1e-9)
+    outline = moved_hull(T, seen.hull_m)
+    return common_area_of(known.hull_m, outline) / max(area_of(outline), 1e-9)
 
 
 def _rotations(

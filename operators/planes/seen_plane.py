@@ -9,10 +9,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 
-from mapstream.recordings.maps.hulls import moved_hull
+from mapstream.recordings.maps.hulls import area_of, common_area_of, moved_hull
 from mapstream.streams.arrays import FloatArray
 from mapstream.streams.geometry import invert
 
@@ -75,9 +74,8 @@ def overlap_of(a: SeenPlane, b: SeenPlane) -> float:
         common = min(a_high, b_high) - max(a_low, b_low)
         return max(0.0, common) / max(min(a_high - a_low, b_high - b_low), 1e-9)
     outline = moved_hull(invert(a.T_frame_plane) @ b.T_frame_plane, b.hull_m)
-    one, other = a.hull_m.astype(np.float32), outline.astype(np.float32)
-    common, _ = cv2.intersectConvexConvex(one, other)
-    return float(common) / max(min(cv2.contourArea(one), cv2.contourArea(other)), 1e-9)
+    smaller = min(area_of(a.hull_m), area_of(outline))
+    return common_area_of(a.hull_m, outline) / max(smaller, 1e-9)
 
 
 def _extent(plane: SeenPlane, along: FloatArray) -> tuple[float, float]:

@@ -48,3 +48,45 @@ def moved_hull(T_a_b: FloatArray, hull_m: FloatArray) -> FloatArray:
     """Return a hull (K, 2) of a pose b on a plane in x and y of another, a: what stands out is left out."""
     moved: FloatArray = hull_m @ T_a_b[:2, :2].T + T_a_b[:2, 3]
     return moved
+
+
+def area_of(hull_m: FloatArray) -> float:
+    """Return the area [m^2] of a hull (K, 2)."""
+    return abs(_signed_area(hull_m))
+
+
+def common_area_of(a_m: FloatArray, b_m: FloatArray) -> float:
+    """Return the area [m^2] that lies in two hulls (K, 2) and (M, 2), by cutting one at each side of the other.
+
+    `cv2.intersectConvexConvex` finds nothing in common where corners or sides nearly meet.
+    Source: Sutherland, Hodgman: Reentrant polygon clipping, CACM 1974.
+    """
+    ways_round = np.sign(_signed_area(a_m))
+    rest = b_m
+    for corner, following in zip(a_m, np.roll(a_m, -1, axis=0), strict=True):
+        side = following - corner
+        left = np.array([-side[1], side[0]]) * ways_round
+        inward = (rest - corner) @ left  # how far inside, in units of the side's length
+        rest = _cut(rest, inward)
+        if len(rest) < 3:
+            return 0.0
+    return area_of(rest) if len(a_m) > 2 else 0.0
+
+
+def _cut(hull: FloatArray, inward: FloatArray) -> FloatArray:
+    """Return the part (K, 2) of a hull whose corners are inside, and where its sides cross the border."""
+    kept = list[FloatArray]()
+    for row, corner in enumerate(hull):
+        before, now = inward[row - 1], inward[row]
+        if before * now < 0:
+            kept.append(hull[row - 1] + before / (before - now) * (corner - hull[row - 1]))
+        if now >= 0:
+            kept.append(corner)
+    return np.array(kept).reshape(-1, 2)
+
+
+def _signed_area(hull: FloatArray) -> float:
+    if len(hull) < 3:
+        return 0.0
+    x, y = (hull - hull[0]).T
+    return float(0.5 * (x @ np.roll(y, -1) - y @ np.roll(x, -1)))

@@ -131,6 +131,40 @@ async def test_N3_the_outline_grows_as_more_is_seen() -> None:
     assert np.ptp(known.plane.hull_m, axis=0) == pytest.approx([5.0, 1.0], abs=0.02)
 
 
+async def test_N3_pieces_of_one_floor_become_one_once_a_piece_lies_on_both() -> None:
+    """The older name stays; what shows that they are one measures both, so that they are one in the map, too."""
+    left, right, between = table(2, 1.0, 0.0), table(2, -1.0, 0.0), table(2, 0.0, 0.0)
+    wide = SQUARE * [1.0, 1.5]
+    operator = PlaneLandmarks(PlaneLandmarksConfig())
+
+    out = await run_operator(
+        operator,
+        config=PlaneLandmarksConfig(),
+        planes=[seen(1, left), seen(2, right), seen(3, between, hulls=[wide]), seen(4, right)],
+        odometry=moves(10),
+    )
+
+    first, second = "plane:1000000000:0", "plane:2000000000:0"
+    named = [(c.stamp_ns // SECOND_NS, c.landmark.name) for c in out["constraints"]]
+    assert named == [(1, first), (2, second), (3, first), (3, second), (4, first)]
+    (known,) = operator.known.planes
+    assert np.ptp(known.plane.hull_m, axis=0) == pytest.approx([1.0, 3.0], abs=0.02)
+
+
+async def test_N3_pieces_that_were_seen_above_each_other_never_become_one() -> None:
+    """A board before a wall is another plane after a long way, too, when both are within reach."""
+    board, wall = table(2, 0, 0.12), table(2, 0.1, 0.0)
+
+    found = await names(
+        seen(0, board, wall),
+        seen(9, wall, T_world_base=SE3.from_rotation(np.eye(3), [9.0, 0, 0])),
+        seen(10, board, wall, T_world_base=SE3.from_rotation(np.eye(3), [10.0, 0, 0])),
+        odometry=moves(10, speed_mps=1.0),
+    )
+
+    assert found == ["A", "B", "B", "A", "B"]
+
+
 async def test_N3_what_lies_on_a_table_is_not_the_table() -> None:
     """Within reach of the table, but beside it in the same image."""
     board, box = table(2, 0), table(2.1, 0, 0.95)
