@@ -38,6 +38,7 @@ class Observability:
     variance: float  # [m^2] that one row of unit weight was taken to have
     unseen: FloatArray  # (K, 6) directions that are open, unit vectors
     seen_part: FloatArray  # (6, 6) takes a tangent vector to its part that is not open
+    least_surplus: float  # over noise, in units of it, of the direction that shows the least
 
     def __post_init__(self) -> None:
         for name in ("information", "covariance", "unseen", "seen_part"):
@@ -72,7 +73,8 @@ def observability_of_planes(
     squares = jacobian.T @ jacobian
     noise = _seen_by_noise(points * root[:, None], root) * np.outer(scale, scale)
     surplus, axes = np.linalg.eigh(squares - noise)
-    is_open = surplus <= least_surplus * np.einsum("ik,ij,jk->k", axes, noise, axes)
+    along = np.einsum("ik,ij,jk->k", axes, noise, axes)
+    is_open = surplus <= least_surplus * along
     open_axes = _pure(axes.T[is_open])
     unseen = open_axes * scale
     unseen /= np.linalg.norm(unseen, axis=1, keepdims=True)
@@ -87,6 +89,7 @@ def observability_of_planes(
         variance=variance,
         unseen=unseen,
         seen_part=scale[:, None] * seen_part / scale,
+        least_surplus=float(np.min(surplus / np.maximum(along, np.finfo(float).tiny))),
     )
 
 

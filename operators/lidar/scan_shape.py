@@ -12,12 +12,33 @@ from small_gicp import KdTree, PointCloud
 from mapstream.operators.lidar.observability import observability_of_planes
 from mapstream.streams.arrays import FloatArray
 
-_NUM_PLACES = 500
+_NUM_PLACES = 300
 _NUM_NEIGHBOURS = 12
-_FLAT = 0.1  # a surface's points are so much farther spread in either direction than across ...
-_WIDE = 0.05  # ... and no line
-_LEAST_SURPLUS = 10.0  # normals between the rings of one scan are noisier than those of a map
+_WIDE = (
+    0.05  # a surface's points are spread so much more along it than a line's, in either direction
+)
+_LEAST_SURPLUS = (
+    15.0  # where a room or a street holds a scan it is 35 and more, in a blank corridor 2
+)
 _LEAST_PLACES = 30  # with fewer nothing is said
+_NEARLY = 2.0  # a surplus below so many times the least may soon be too little
+_SELDOM = 4  # scans; surroundings that hold a scan well do not let it go within less
+
+
+class OpenDirections:
+    """The directions that scan after scan leaves open; asks each scan where it is close, else only some."""
+
+    def __init__(self) -> None:
+        self._num_to_skip = 0
+
+    def of(self, points: FloatArray) -> FloatArray:
+        """Return the directions (K, 6) that the next scan (N, 3) leaves open, as `open_directions_of_scan` does."""
+        if self._num_to_skip:
+            self._num_to_skip -= 1
+            return np.empty((0, 6))
+        unseen, surplus = _shape_of(points)
+        self._num_to_skip = 0 if surplus < _NEARLY * _LEAST_SURPLUS else _SELDOM - 1
+        return unseen
 
 
 def open_directions_of_scan(points: FloatArray) -> FloatArray:
@@ -25,21 +46,29 @@ def open_directions_of_scan(points: FloatArray) -> FloatArray:
 
     Rotation first [rad, m], in the scan's frame; none where there are too few surfaces to say so.
     """
+    return _shape_of(points)[0]
+
+
+def _shape_of(points: FloatArray) -> tuple[FloatArray, float]:
+    """Return the open directions, and how far the weakest direction stands out of noise.
+
+    A place counts by the direction in which its neighbourhood is thinnest, however thick that is: plants and
+    small things have any such direction, and hold a scan in all.
+    """
+    nothing = np.empty((0, 6)), 0.0
     if len(points) < _NUM_NEIGHBOURS:
-        return np.empty((0, 6))
-    tree = KdTree(PointCloud(points), 1)
-    chosen = np.random.default_rng(0).permutation(len(points))[
-        :_NUM_PLACES
-    ]  # a stride would meet the rings'
+        return nothing
+    # At random, for a stride would meet the rings'.
+    chosen = np.random.default_rng(0).permutation(len(points))[:_NUM_PLACES]
     places = points[chosen]
+    tree = KdTree(PointCloud(points), 1)
     neighbours, _ = tree.batch_knn_search(places, _NUM_NEIGHBOURS)
     near = points[np.asarray(neighbours, dtype=np.int64)]  # (M, K, 3)
     spread = near - near.mean(axis=1, keepdims=True)
-    extents, axes = np.linalg.eigh(np.einsum("nki,nkj->nij", spread, spread))
-    is_flat = extents[:, 0] < _FLAT**2 * extents[:, 1]
-    is_flat &= extents[:, 1] > _WIDE * extents[:, 2]
-    if is_flat.sum() < _LEAST_PLACES:
-        return np.empty((0, 6))
-    normals = axes[is_flat, :, 0]
-    found = observability_of_planes(places[is_flat], normals, 0.0, least_surplus=_LEAST_SURPLUS)
-    return found.unseen
+    extents, axes = np.linalg.eigh(spread.transpose(0, 2, 1) @ spread)
+    is_surface = extents[:, 1] > _WIDE * extents[:, 2]
+    if is_surface.sum() < _LEAST_PLACES:
+        return nothing
+    normals = axes[is_surface, :, 0]
+    found = observability_of_planes(places[is_surface], normals, 0.0, least_surplus=_LEAST_SURPLUS)
+    return found.unseen, found.least_surplus

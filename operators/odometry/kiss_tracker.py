@@ -8,7 +8,7 @@ import numpy as np
 from kiss_icp.config import KISSConfig
 from kiss_icp.kiss_icp import KissICP
 
-from mapstream.operators.lidar.scan_shape import open_directions_of_scan
+from mapstream.operators.lidar.scan_shape import OpenDirections
 from mapstream.operators.odometry.recent_voxels import RecentVoxels
 from mapstream.operators.odometry.scan_motion import Sweep, is_plausible
 from mapstream.streams.arrays import FloatArray
@@ -36,6 +36,7 @@ class KissTracker:
         self._icp = KissICP(config)
         self._limits = limits
         self._recent = RecentVoxels(2 * config.mapping.voxel_size)
+        self._open_directions = OpenDirections()
         self._num_lost = 0
         self.has_map = False
         self.unseen: FloatArray = np.empty((0, 6))  # directions that the last scan left open
@@ -82,7 +83,7 @@ class KissTracker:
             max_correspondance_distance=3 * sigma,
             kernel=sigma,
         )
-        self.unseen = open_directions_of_scan(frame_downsample)
+        self.unseen = self._open_directions.of(frame_downsample)
         moved = SE3(pose) @ source
         if self.has_map:
             try:

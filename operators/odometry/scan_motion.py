@@ -39,7 +39,8 @@ class Sweep:
         Times that are all the same are taken for no times: KISS-ICP divides by their span, and aborts the
         process if that is zero.
         """
-        keep = usable(scan.points, min_range_m, max_range_m)
+        is_usable = usable(scan.points, min_range_m, max_range_m)
+        keep = slice(None) if is_usable.all() else np.flatnonzero(is_usable)
         offsets_ns = None if scan.offsets_ns is None else scan.offsets_ns[keep]
         if offsets_ns is not None and (not offsets_ns.size or np.ptp(offsets_ns) == 0):
             offsets_ns = None

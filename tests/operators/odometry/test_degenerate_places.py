@@ -13,7 +13,8 @@ import pytest
 from mapstream.operators.backend.optimizer import Optimizer, OptimizerConfig
 from mapstream.operators.estimation.noise import NoiseModels, noise_from_covariance
 from mapstream.operators.lidar.observability import observability_of_planes
-from mapstream.operators.lidar.scan_shape import open_directions_of_scan
+from mapstream.operators.lidar.sampling import voxel_indices
+from mapstream.operators.lidar.scan_shape import OpenDirections, open_directions_of_scan
 from mapstream.operators.odometry.continuous import ContinuousSource
 from mapstream.operators.odometry.gicp_odometry import GicpOdometry, GicpOdometryConfig
 from mapstream.operators.odometry.kiss_odometry import KissOdometry, KissOdometryConfig
@@ -43,6 +44,7 @@ from mapstream.streams.arrays import FloatArray
 from mapstream.streams.geometry import SE3, so3_exp
 from mapstream.streams.messages.estimates import UNOBSERVED_VARIANCE, Odometry
 from mapstream.streams.messages.sensors import ImuBatch, LidarScan, WheelOdometry
+from tests.data import shared
 
 ALONG = np.array([0.0, 0.0, 0.0, np.cos(0.4), np.sin(0.4), 0.0])  # a corridor's axis, seen askew
 
@@ -97,6 +99,22 @@ def test_U8_a_scan_alone_shows_what_it_leaves_open() -> None:
 
     assert abs(found @ ALONG) > 0.99
     assert not len(open_directions_of_scan(corridor(4000, has_end=True)[0]))
+
+
+def test_U8_a_street_leaves_nothing_open() -> None:
+    """Plants, poles and cars hold a scan, although most of the flat places are road."""
+    for path in sorted(shared("kitti00_lidar").glob("*.bin"))[:3]:
+        points = np.fromfile(path, np.float32).reshape(-1, 4)[:, :3].astype(np.float64)
+        assert not len(open_directions_of_scan(points[voxel_indices(points, 0.5)]))
+
+
+def test_scans_are_asked_seldom_where_much_holds_them_and_always_where_little_does() -> None:
+    blank, closed = corridor(4000)[0], corridor(4000, has_end=True)[0]
+    directions = OpenDirections()
+
+    found = [len(directions.of(points)) for points in [closed, *[blank] * 6, closed, blank]]
+
+    assert found == [0, 0, 0, 0, 1, 1, 1, 0, 0]
 
 
 def test_U8_the_solver_gets_no_information_along_an_open_direction() -> None:
