@@ -9,6 +9,7 @@ LIDAR SLAM, ICRA 2016, section V.
 from __future__ import annotations
 
 import heapq
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import cv2
@@ -16,12 +17,14 @@ import numpy as np
 import numpy.typing as npt
 
 from mapstream.operators.laser.planar import apply
-from mapstream.streams.arrays import FloatArray, IntArray
+from mapstream.streams.arrays import BoolArray, FloatArray, IntArray
 
 _NUM_LEVELS = 4  # up to blocks of 16 x 16 poses
 _BATCH = 64  # blocks that are looked into together
 _MAX_POINTS = 150
 _MAX_SIDE = 4096  # cells of a grid
+_APART_M = 0.5  # poses count as different from so far apart, along an axis
+_APART_RAD = 0.25  # or in direction
 
 Bytes = npt.NDArray[np.uint8]
 
@@ -37,7 +40,7 @@ class Window:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Basin:
-    """The best pose on the grid."""
+    """The best pose on the grid, or around it."""
 
     pose: FloatArray  # (3,)
     score: float  # mean likelihood of the points, at most 1
@@ -75,12 +78,26 @@ class LikelihoodGrid:
         cells: IntArray = np.floor((points - self._origin_m) / self.resolution_m).astype(np.int64)
         return cells
 
-    def search(
-        self, points: FloatArray, guess: FloatArray, window: Window, least_score: float = 0.0
-    ) -> Basin:
-        """Return the likeliest pose of points (N, 2) within the window; of equals one, always the same.
+    def search(self, points: FloatArray, guess: FloatArray, window: Window) -> Basin:
+        """Return the likeliest pose of points (N, 2) within the window; of equals one, always the same."""
+        return next(self.basins(points, guess, window))
 
-        The search ends when no pose can reach `least_score`: the pose is then a rough one, with a lower score.
+    def basins(
+        self,
+        points: FloatArray,
+        guess: FloatArray,
+        window: Window,
+        least_score: float = 0.0,
+        within: float = 1.0,
+    ) -> Iterator[Basin]:
+        """Yield the likeliest pose of points (N, 2) within the window, then the likeliest apart from it, and so on.
+
+        Args:
+            points: Of the scan.
+            guess: (3,) the middle of the window.
+            window: Where to look.
+            least_score: It ends when no pose apart from the others can reach that.
+            within: It ends as well when none can come so near to the score of the best.
         """
         if len(points) > _MAX_POINTS:
             points = points[np.linspace(0, len(points) - 1, _MAX_POINTS).astype(int)]
@@ -91,30 +108,37 @@ class LikelihoodGrid:
         reach = int(np.ceil(window.radius_m / self.resolution_m))
         shifts = np.arange(-reach, reach + 1, 2 ** (len(self._levels) - 1))
         first = np.stack(np.meshgrid(np.arange(len(turns)), shifts, shifts, indexing="ij"), -1)
-        best, score = self._best(cells, first.reshape(-1, 3), reach, least_score)
-        shift_m = best[1:] * self.resolution_m
-        pose = np.append(guess[:2] + shift_m, guess[2] + turns[best[0]])
-        return Basin(pose, score)
-
-    def _best(
-        self, cells: IntArray, blocks: IntArray, reach: int, least_score: float
-    ) -> tuple[IntArray, float]:
-        """Look into the blocks that promise most, until one pose is better than all other blocks can be."""
         heap: list[tuple[float, int, tuple[int, ...]]] = []
-        self._push(heap, cells, blocks, len(self._levels) - 1)
-        while heap[0][1] > 0 and -heap[0][0] >= least_score:
+        self._push(heap, cells, first.reshape(-1, 3), len(self._levels) - 1)
+        taken: list[FloatArray] = []
+        while heap and -heap[0][0] >= least_score:
             level = heap[0][1]
             batch = [heapq.heappop(heap)]
-            while heap and len(batch) < _BATCH and heap[0][1] == level:
+            while level and heap and len(batch) < _BATCH and heap[0][1] == level:
                 batch.append(heapq.heappop(heap))
-            parents = np.array([block for _, _, block in batch])
-            half = 2 ** (level - 1)
-            quarters = np.array([[0, 0, 0], [0, half, 0], [0, 0, half], [0, half, half]])
-            children = (parents[:, None] + quarters).reshape(-1, 3)
-            children = children[(children[:, 1:] <= reach).all(axis=1)]
-            self._push(heap, cells, children, level - 1)
-        bound, _, block = heap[0]
-        return np.array(block), -bound
+            blocks = np.array([block for _, _, block in batch])
+            low = np.column_stack(
+                [guess[:2] + blocks[:, 1:] * self.resolution_m, guess[2] + turns[blocks[:, 0]]]
+            )
+            blocks = blocks[~self._is_taken(low, level, taken)]
+            if level:
+                self._push(heap, cells, _quarters(blocks, level, reach), level - 1)
+            elif len(blocks):
+                score = -batch[0][0]
+                if not taken:
+                    least_score = max(least_score, score - within)
+                taken.append(low[0])
+                yield Basin(low[0], score)
+
+    def _is_taken(self, low: FloatArray, level: int, taken: list[FloatArray]) -> BoolArray:
+        """Return which blocks (N,), each by its first pose (N, 3), lie wholly near a pose that was found."""
+        middle_m = (2**level - 1) * self.resolution_m / 2
+        is_taken = np.zeros(len(low), np.bool_)
+        for pose in taken:
+            off = np.abs(low - pose + [middle_m, middle_m, 0.0])
+            turn = np.minimum(off[:, 2] % (2 * np.pi), -off[:, 2] % (2 * np.pi))
+            is_taken |= (off[:, :2].max(axis=1) + middle_m < _APART_M) & (turn < _APART_RAD)
+        return is_taken
 
     def _push(
         self,
@@ -141,6 +165,14 @@ class LikelihoodGrid:
             likelihood = np.where(inside, grid[at[..., 1], at[..., 0]], 0)
             scores[start : start + 2048] = likelihood.mean(axis=1) / 255
         return scores
+
+
+def _quarters(blocks: IntArray, level: int, reach: int) -> IntArray:
+    """Return the blocks of the next level that make up some (N, 3) of this one, as far as the window reaches."""
+    half = 2 ** (level - 1)
+    corners = np.array([[0, 0, 0], [0, half, 0], [0, 0, half], [0, half, half]])
+    children: IntArray = (blocks[:, None] + corners).reshape(-1, 3)
+    return children[(children[:, 1:] <= reach).all(axis=1)]
 
 
 def _block_maxima(grid: Bytes, half: int) -> Bytes:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -14,6 +15,7 @@ from mapstream.operators.laser.matching import LineTarget
 from mapstream.operators.laser.planar import flattened
 from mapstream.operators.laser.recent_scans import first_in_cells
 from mapstream.operators.laser.surfaces import Surface, surface_of_cloud
+from mapstream.operators.laser.walls import Walls
 from mapstream.recordings.cloud_store import read_cloud
 from mapstream.recordings.grid_files import is_grid_file, read_grid
 from mapstream.recordings.maps import load_map
@@ -27,9 +29,11 @@ _OCCUPIED_FROM = 65  # percent
 _BLUR_CELLS = 1.5  # over which the side of the free space is looked for
 _LEAST_SLOPE = 0.05
 _MIN_POINTS = 50
-_RESOLUTION_M = 0.05  # of the search
+_WALL_M = 0.05  # cells of the walls that beams do not pass
+_RESOLUTION_M = 0.1  # of the search, whose poses are refined
+_TURN_STEP_RAD = float(np.radians(2.5))
 _MAX_SIDE = 4000  # cells of the search; larger floors are searched more coarsely
-_NUM_LEVELS = 6  # blocks of 64 x 64 poses at first
+_NUM_LEVELS = 5  # blocks of 32 x 32 poses at first
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,20 +51,23 @@ class Floor:
     def _likelihood(self) -> LikelihoodGrid:
         points = self.surface.points
         resolution_m = max(_RESOLUTION_M, float(np.ptp(points, axis=0).max()) / _MAX_SIDE)
-        sigma_m = 2 * resolution_m
+        sigma_m = 1.5 * resolution_m
         return LikelihoodGrid(
             points, resolution_m=resolution_m, sigma_m=sigma_m, num_levels=_NUM_LEVELS
         )
 
-    def search(self, points: FloatArray, least_score: float = 0.0) -> Basin:
-        """Return the likeliest pose (3,) of points (N, 2) anywhere on the floor, in any direction.
-
-        The search gives up when no pose can reach `least_score`; the pose is then a rough one, with a lower score.
-        """
+    def basins(self, points: FloatArray, least_score: float, within: float) -> Iterator[Basin]:
+        """Yield the likeliest poses of points (N, 2) on the floor, in any direction; see `LikelihoodGrid.basins`."""
         low, high = self.surface.points.min(axis=0), self.surface.points.max(axis=0)
         middle = np.append((low + high) / 2, 0.0)
-        window = Window(radius_m=max(high - low) / 2, turn_rad=np.pi)
-        return self._likelihood.search(points, middle, window, least_score)
+        radius_m = float((high - low).max()) / 2
+        window = Window(radius_m=radius_m, turn_rad=np.pi, turn_step_rad=_TURN_STEP_RAD)
+        return self._likelihood.basins(points, middle, window, least_score, within)
+
+    @cached_property
+    def walls(self) -> Walls:
+        """Return what no beam can have passed."""
+        return Walls(self.surface, _WALL_M)
 
 
 def open_floor(path: Path, cell_m: float = 0.05) -> Floor:

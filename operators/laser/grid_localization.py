@@ -101,5 +101,6 @@ class GridLocalization(Operator[Inputs, Outputs]):
             poses=np.stack([move.T_odom_base.matrix for move in moves]),
         )
         ends = beam_ends(scan, way)
-        surface = surface_of(ends.points[:, :2], scan.T_base_sensor.t[:2])
-        return self._tracker.track(ends.stamp_ns, surface, way.pose_at(ends.stamp_ns))
+        eye = scan.T_base_sensor.t[:2]
+        surface = surface_of(ends.points[:, :2], eye)
+        return self._tracker.track(ends.stamp_ns, surface, way.pose_at(ends.stamp_ns), eye)
