@@ -81,7 +81,8 @@ def compare(  # noqa: PLR0913  # one for each option of the command
         list[str] | None,
         typer.Option(
             metavar="OPERATOR.KEY=A,B,...",
-            help="Values to compare; without a dot, of a parameter. Several: every combination.",
+            help="Values to compare, a list in brackets: [],[a],[a,b]; without a dot, of a parameter."
+            " Several: every combination.",
         ),
     ] = None,
     truth: Annotated[
