@@ -27,6 +27,7 @@ _APART_M = 0.5  # poses count as different from so far apart, along an axis
 _APART_RAD = 0.25  # or in direction
 
 Bytes = npt.NDArray[np.uint8]
+_Block = tuple[float, int, tuple[int, ...]]  # less its bound, its level, its first pose
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -108,27 +109,24 @@ class LikelihoodGrid:
         reach = int(np.ceil(window.radius_m / self.resolution_m))
         shifts = np.arange(-reach, reach + 1, 2 ** (len(self._levels) - 1))
         first = np.stack(np.meshgrid(np.arange(len(turns)), shifts, shifts, indexing="ij"), -1)
-        heap: list[tuple[float, int, tuple[int, ...]]] = []
+        heap: list[_Block] = []
         self._push(heap, cells, first.reshape(-1, 3), len(self._levels) - 1)
         taken: list[FloatArray] = []
         while heap and -heap[0][0] >= least_score:
-            level = heap[0][1]
-            batch = [heapq.heappop(heap)]
-            while level and heap and len(batch) < _BATCH and heap[0][1] == level:
-                batch.append(heapq.heappop(heap))
-            blocks = np.array([block for _, _, block in batch])
-            low = np.column_stack(
-                [guess[:2] + blocks[:, 1:] * self.resolution_m, guess[2] + turns[blocks[:, 0]]]
-            )
-            blocks = blocks[~self._is_taken(low, level, taken)]
-            if level:
-                self._push(heap, cells, _quarters(blocks, level, reach), level - 1)
-            elif len(blocks):
-                score = -batch[0][0]
-                if not taken:
-                    least_score = max(least_score, score - within)
-                taken.append(low[0])
-                yield Basin(low[0], score)
+            batch = _promising(heap, least_score)
+            for level in np.unique(batch[:, 0]).tolist():
+                blocks = batch[batch[:, 0] == level, 1:]
+                shifts_m = blocks[:, 1:] * self.resolution_m
+                low = np.column_stack([guess[:2] + shifts_m, guess[2] + turns[blocks[:, 0]]])
+                blocks = blocks[~self._is_taken(low, level, taken)]
+                if level:
+                    self._push(heap, cells, _quarters(blocks, level, reach), level - 1)
+                elif len(blocks):
+                    score = float(self._scores(cells, blocks, 0)[0])
+                    if not taken:
+                        least_score = max(least_score, score - within)
+                    taken.append(low[0])
+                    yield Basin(low[0], score)
 
     def _is_taken(self, low: FloatArray, level: int, taken: list[FloatArray]) -> BoolArray:
         """Return which blocks (N,), each by its first pose (N, 3), lie wholly near a pose that was found."""
@@ -142,7 +140,7 @@ class LikelihoodGrid:
 
     def _push(
         self,
-        heap: list[tuple[float, int, tuple[int, ...]]],
+        heap: list[_Block],
         cells: IntArray,
         blocks: IntArray,
         level: int,
@@ -159,12 +157,22 @@ class LikelihoodGrid:
         scores = np.empty(len(blocks))
         for start in range(0, len(blocks), 2048):
             part = blocks[start : start + 2048]
-            at = cells[part[:, 0]] + part[:, None, 1:] + span
-            inside = (at >= 0).all(axis=-1) & (at < [columns, rows]).all(axis=-1)
-            at = np.where(inside[..., None], at, 0)
-            likelihood = np.where(inside, grid[at[..., 1], at[..., 0]], 0)
+            column, row = np.moveaxis(cells[part[:, 0]] + part[:, None, 1:] + span, -1, 0)
+            # as unsigned numbers, negative ones are large
+            inside = (column.view(np.uint64) < columns) & (row.view(np.uint64) < rows)
+            likelihood = grid.take(row * columns + column, mode="clip") * inside
             scores[start : start + 2048] = likelihood.mean(axis=1) / 255
         return scores
+
+
+def _promising(heap: list[_Block], least_score: float) -> IntArray:
+    """Take the blocks out that promise most, (N, 4) with the level first; a pose comes alone."""
+    _, level, block = heapq.heappop(heap)
+    batch = [(level, *block)]
+    while level and heap and len(batch) < _BATCH and heap[0][1] and -heap[0][0] >= least_score:
+        _, level, block = heapq.heappop(heap)
+        batch.append((level, *block))
+    return np.array(batch)
 
 
 def _quarters(blocks: IntArray, level: int, reach: int) -> IntArray:

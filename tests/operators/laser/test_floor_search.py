@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from itertools import islice, pairwise
 
 import numpy as np
@@ -21,7 +22,7 @@ WITH_ALCOVE = [(0, 0), (6, 0), (6, 4), (2, 4), (2, 3), (0, 3), (0, 0)]
 START = np.array([4.5, 1.5, 0.4])
 
 
-def outline(corners: list[tuple[float, float]]) -> FloatArray:
+def outline(corners: Sequence[tuple[float, float]]) -> FloatArray:
     """Return points (N, 2) along a closed line, 4 cm apart."""
     parts = [
         np.linspace(a, b, round(float(np.hypot(*np.subtract(b, a))) / 0.04), endpoint=False)
@@ -30,12 +31,12 @@ def outline(corners: list[tuple[float, float]]) -> FloatArray:
     return np.concatenate(parts)
 
 
-def room(corners: list[tuple[float, float]]) -> Surface:
+def room(corners: Sequence[tuple[float, float]]) -> Surface:
     """Return the walls, as a robot sees them that stands where all of them are in sight."""
     return surface_of(outline(corners), START[:2])
 
 
-def found(corners: list[tuple[float, float]]) -> ScanMatch | None:
+def found(corners: Sequence[tuple[float, float]]) -> ScanMatch | None:
     """Return what comes of driving a metre and a half, with odometry that began elsewhere."""
     walls = room(corners)
     search = FloorSearch(Floor(walls), FloorSearchConfig())
