@@ -209,7 +209,7 @@ class Blank:
 def blank() -> Blank:
     lidar = LidarConfig(beams=24, columns=256, max_range_m=12.0)
     world = WLidConfig(length_m=200.0, blank_walls=True, wheel_drift=0.003, lidar=lidar)
-    end_ns = START_NS + 5_000_000_000
+    end_ns = START_NS + 4_000_000_000
     records = takewhile(lambda record: record.log_ns <= end_ns, w_lid(world, 0).records)
     messages = [record.message for record in records]
     return Blank(
