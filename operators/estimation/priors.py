@@ -78,7 +78,8 @@ def _of_walls(map_: Map, rows: IntArray) -> dict[int, Factor]:
     """Return priors on the tilt of planes that edges see as lines, which leave it open."""
     noise = gtsam.noiseModel.Isotropic.Sigma(2, _TILT_SIGMA_RAD)
     edges = map_.edges
-    is_line = (edges.kind[rows] == "plane") & np.isinf(edges.covariance[rows, 0, 0])
+    along, across = edges.covariance[rows, 0, 0], edges.covariance[rows, 1, 1]
+    is_line = (edges.kind[rows] == "plane") & np.isinf(along) & np.isfinite(across)
     walls = np.unique(edges.landmark_a[rows[is_line]])
     known = coefficients(map_.T_map_landmark(walls))
     return {

@@ -191,7 +191,7 @@ def test_a_motion_is_not_extrapolated() -> None:
 @pytest.mark.parametrize(
     ("name", "options", "message"),
     [
-        ("w_lidar", {}, "no world 'w_lidar'; there are w_lid"),
+        ("w_lidar", {}, "no world 'w_lidar'; there are w_2d, w_lid"),
         ("w_lid", {"lenght_m": 40}, r"w_lid.lenght_m: Extra inputs .*; options are length_m"),
         ("w_lid", {"lidar": {"beams": -1}}, r"w_lid.lidar.beams: Input should be greater than 0"),
         ("w_lid", {"length_m": 5}, r"w_lid.length_m: Input should be greater than or equal to 36"),
