@@ -26,6 +26,7 @@ Colors = npt.NDArray[np.uint8]
 _BACKGROUND, _INK = (24, 20, 18), (235, 235, 235)  # blue, green, red
 _MARGIN = 0.04  # of the longer side, around the map
 _LOOP = (80, 200, 80)
+_FLAT_M, _FLAT_COLOR = 0.05, 0xC8D2DCFF
 _NICE = (1.0, 2.0, 5.0)  # lengths that a scale may have, times a power of ten
 
 
@@ -81,6 +82,8 @@ def _drawn(map_: Map, folder: Path, config: PictureConfig) -> tuple[_Drawn, list
         points = cloud.points[shown]
         low, high = np.percentile(points[:, 2], [2, 98])
         packed = ramp_colors(points[:, 2], low, high)
+        if high - low < _FLAT_M:  # a planar laser's
+            packed = np.full(len(points), _FLAT_COLOR, np.uint32)
         if cloud.colors_rgba is not None:
             packed = photographed(packed, cloud.colors_rgba[shown])
         shifts = np.array([24, 16, 8], np.uint32)

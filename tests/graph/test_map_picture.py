@@ -52,6 +52,22 @@ def test_P3_a_picture_shows_the_wall_and_the_way_where_they_are(tmp_path: Path) 
     assert begin[:, 0].mean() - red[:, 0].mean() == pytest.approx(3 * px_per_m, abs=3)
 
 
+def test_P3_walls_of_a_planar_laser_are_bright(tmp_path: Path) -> None:
+    """They have one height, so no ramp of heights tells them from the background."""
+    wall = np.column_stack([np.linspace(0, 5, 500), np.full(500, 3.0), np.zeros(500)])
+    with CloudStore(tmp_path / "clouds") as store:
+        store.put("c", PointCloud(stamp_ns=0, points=wall.astype(np.float32)))
+    map_ = add_resources(
+        line_map(6), vertex_rows=np.array([0]), kind="cloud", paths=["clouds/c.arrow"]
+    )
+
+    write_picture(map_, tmp_path, tmp_path / "m.png", _CONFIG)
+
+    image = cv2.imread(str(tmp_path / "m.png"))
+    assert image is not None
+    assert (image[:30].min(axis=2) > 150).sum() > 200
+
+
 def test_P3_a_page_holds_everything_it_shows(tmp_path: Path) -> None:
     write_picture(_map_with_a_wall(tmp_path), tmp_path, tmp_path / "m.html", _CONFIG)
 
