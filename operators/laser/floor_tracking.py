@@ -22,6 +22,7 @@ from mapstream.operators.laser.matching import ScanMatch
 from mapstream.operators.laser.planar import difference, flattened, lifted, lifted_covariance
 from mapstream.operators.laser.surfaces import Surface
 from mapstream.operators.places.drift import Drift, DriftConfig, Fix
+from mapstream.operators.places.map_poses import MapPoses
 from mapstream.streams.arrays import FloatArray
 from mapstream.streams.geometry import SE3
 from mapstream.streams.messages.estimates import MapPose
@@ -64,11 +65,11 @@ class FloorTracker:
         self._search = FloorSearch(floor, config)
         self._num_misfits = config.max_misfits  # lost at first
         self._T_start_odom: SE3 | None = None  # carries the odometry to where it may have started
-        self._has_tracked = self._was_tracking = False
+        self._poses = MapPoses()
 
     @property
     def has_tracked(self) -> bool:
-        return self._has_tracked
+        return self._poses.has_tracked
 
     def track(self, stamp_ns: int, surface: Surface, T_odom_base: SE3, eye: FloatArray) -> MapPose:
         """Return where the robot is, by a scan and the odometry at its stamp.
@@ -134,19 +135,5 @@ class FloorTracker:
         T_map_odom = self._drift.T_map_odom(stamp_ns)
         if self._is_lost:
             T_map_odom = None
-        is_back = T_map_odom is not None and self._has_tracked and not self._was_tracking
-        self._was_tracking = T_map_odom is not None
-        self._has_tracked |= self._was_tracking
-        if T_map_odom is None:
-            return MapPose(
-                stamp_ns=stamp_ns, state="lost", num_inliers=num_fitting, verdict=verdict
-            )
-        return MapPose(
-            stamp_ns=stamp_ns,
-            state="recovered" if is_back else "tracking",
-            T_map_base=T_map_odom @ T_odom_base,
-            T_map_odom=T_map_odom,
-            covariance=self._drift.covariance,
-            num_inliers=num_fitting,
-            verdict=verdict,
-        )
+        moment = stamp_ns, T_odom_base
+        return self._poses.next(moment, T_map_odom, self._drift.covariance, num_fitting, verdict)

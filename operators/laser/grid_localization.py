@@ -15,6 +15,7 @@ from mapstream.operators.laser.floor import open_floor
 from mapstream.operators.laser.floor_tracking import FloorConfig, FloorTracker
 from mapstream.operators.laser.surfaces import surface_of
 from mapstream.operators.operator import Operator, Placement, offload, warn
+from mapstream.operators.places.map_poses import send_pose
 from mapstream.streams.channel import Receiver, Sender
 from mapstream.streams.messages.estimates import MapPose, Odometry
 from mapstream.streams.messages.sensors import LaserScan2D, WheelOdometry
@@ -74,12 +75,7 @@ class GridLocalization(Operator[Inputs, Outputs]):
                 outputs.odometry.advance(scan.end_ns)
                 continue
             pose = await offload(self.locate, scan, known)
-            await outputs.poses.send(pose)
-            if pose.T_map_base is None:
-                outputs.odometry.advance(pose.stamp_ns)
-            else:
-                found = Odometry(stamp_ns=pose.stamp_ns, T_odom_base=pose.T_map_base)
-                await outputs.odometry.send(found)
+            await send_pose(pose, outputs.poses, outputs.odometry)
         if self._tracker is not None and not self._tracker.has_tracked:
             warn("the robot was never found in the map")
 

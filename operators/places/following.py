@@ -6,6 +6,7 @@ from bisect import bisect_left
 from collections.abc import Sequence
 
 from mapstream.operators.places.drift import Drift, DriftConfig, Fix
+from mapstream.operators.places.map_poses import MapPoses
 from mapstream.streams.arrays import FloatArray
 from mapstream.streams.geometry import SE3
 from mapstream.streams.messages.estimates import MapPose, Odometry
@@ -22,8 +23,11 @@ class Following:
     def __init__(self, config: DriftConfig, late_ns: int) -> None:
         self._drift, self._late_ns = Drift(config), late_ns
         self._moves: list[Odometry] = []  # as far back as fixes may be late
-        self._was_tracking = False
-        self.has_tracked = False
+        self._poses = MapPoses()
+
+    @property
+    def has_tracked(self) -> bool:
+        return self._poses.has_tracked
 
     @property
     def is_lost(self) -> bool:
@@ -55,22 +59,8 @@ class Following:
         while len(self._moves) > 1 and self._moves[1].stamp_ns <= odometry.stamp_ns - self._late_ns:
             del self._moves[0]
         T_map_odom = self._drift.T_map_odom(odometry.stamp_ns)
-        is_back = T_map_odom is not None and self.has_tracked and not self._was_tracking
-        self._was_tracking = T_map_odom is not None
-        self.has_tracked |= self._was_tracking
-        if T_map_odom is None:
-            return MapPose(
-                stamp_ns=odometry.stamp_ns, state="lost", num_inliers=num_inliers, verdict=verdict
-            )
-        return MapPose(
-            stamp_ns=odometry.stamp_ns,
-            state="recovered" if is_back else "tracking",
-            T_map_base=T_map_odom @ odometry.T_odom_base,
-            T_map_odom=T_map_odom,
-            covariance=self._drift.covariance,
-            num_inliers=num_inliers,
-            verdict=verdict,
-        )
+        moment = odometry.stamp_ns, odometry.T_odom_base
+        return self._poses.next(moment, T_map_odom, self._drift.covariance, num_inliers, verdict)
 
 
 def _at(moves: Sequence[Odometry], stamp_ns: int) -> SE3:

@@ -12,6 +12,7 @@ from mapstream.operators.operator import Operator, OperatorConfig, Placement, of
 from mapstream.operators.places.drift import DriftConfig
 from mapstream.operators.places.following import Following
 from mapstream.operators.places.map_places import MapPlaces
+from mapstream.operators.places.map_poses import send_pose
 from mapstream.operators.places.recognition import Recognition, RecognitionConfig
 from mapstream.operators.places.views import view_of
 from mapstream.recordings.maps import load_map
@@ -72,13 +73,15 @@ class Localize(Operator[Inputs, Outputs]):
         if inputs.odometry is None:
             async for frame in inputs.n_frames:
                 if self._is_due(frame):
-                    await self._send(outputs, await offload(self.locate, frame))
+                    pose = await offload(self.locate, frame)
+                    await send_pose(pose, outputs.poses, outputs.odometry)
             return
         async for _, message in merge(
             inputs.odometry, inputs.n_frames, delays_ns=(0, self._late_ns)
         ):
             if isinstance(message, Odometry):
-                await self._send(outputs, await offload(self.follow, message))
+                pose = await offload(self.follow, message)
+                await send_pose(pose, outputs.poses, outputs.odometry)
             elif self._is_due(message):
                 self._waiting.append(message)
         if not self._following.has_tracked:
@@ -93,15 +96,6 @@ class Localize(Operator[Inputs, Outputs]):
             return False
         self._compared_ns = frame.stamp_ns
         return True
-
-    async def _send(self, outputs: Outputs, pose: MapPose) -> None:
-        await outputs.poses.send(pose)
-        if pose.T_map_base is not None:
-            await outputs.odometry.send(
-                Odometry(stamp_ns=pose.stamp_ns, T_odom_base=pose.T_map_base)
-            )
-        else:
-            outputs.odometry.advance(pose.stamp_ns)
 
     def locate(self, frame: NFrame) -> MapPose:
         """Return where one frame was taken, by itself."""

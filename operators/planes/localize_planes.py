@@ -12,6 +12,7 @@ from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveFloat, Pos
 
 from mapstream.operators.operator import Operator, OperatorConfig, Placement, offload, warn
 from mapstream.operators.places.drift import Drift, DriftConfig, Fix
+from mapstream.operators.places.map_poses import MapPoses, send_pose
 from mapstream.operators.planes.known_planes import KnownPlanes, Reach
 from mapstream.operators.planes.period import Period
 from mapstream.operators.planes.plane_evidence import KnownOutlines, samples_of
@@ -106,7 +107,7 @@ class LocalizePlanes(Operator[Inputs, Outputs]):
         self._where = Whereabouts(lost_m=0.0)
         self._recent = KnownPlanes(_reach(config), "recent")
         self._waiting: list[PlaneSegments] = []
-        self._has_tracked = self._was_tracking = False
+        self._poses = MapPoses()
         self._num_doubts = 0
 
     async def run(self, inputs: Inputs, outputs: Outputs) -> None:
@@ -117,13 +118,8 @@ class LocalizePlanes(Operator[Inputs, Outputs]):
                     self._waiting.append(message)
                 continue
             pose = await offload(self.follow, message)
-            await outputs.poses.send(pose)
-            if pose.T_map_base is not None:
-                sent = Odometry(stamp_ns=pose.stamp_ns, T_odom_base=pose.T_map_base)
-                await outputs.odometry.send(sent)
-            else:
-                outputs.odometry.advance(pose.stamp_ns)
-        if not self._has_tracked:
+            await send_pose(pose, outputs.poses, outputs.odometry)
+        if not self._poses.has_tracked:
             warn("the robot was never found in the map")
 
     def follow(self, odometry: Odometry) -> MapPose:
@@ -135,19 +131,8 @@ class LocalizePlanes(Operator[Inputs, Outputs]):
             num_planes, verdict = self._locate(planes)
         self._waiting.clear()
         T_map_odom = self._drift.T_map_odom(odometry.stamp_ns)
-        is_back = T_map_odom is not None and self._has_tracked and not self._was_tracking
-        self._was_tracking = T_map_odom is not None
-        self._has_tracked |= self._was_tracking
-        is_found = T_map_odom is not None
-        return MapPose(
-            stamp_ns=odometry.stamp_ns,
-            state="recovered" if is_back else "tracking" if is_found else "lost",
-            T_map_base=None if T_map_odom is None else T_map_odom @ odometry.T_odom_base,
-            T_map_odom=T_map_odom,
-            covariance=self._drift.covariance if is_found else None,
-            num_inliers=num_planes,
-            verdict=verdict,
-        )
+        moment = odometry.stamp_ns, odometry.T_odom_base
+        return self._poses.next(moment, T_map_odom, self._drift.covariance, num_planes, verdict)
 
     def _locate(self, planes: PlaneSegments) -> tuple[int, str]:
         """Correct the pose by what was seen at one moment; return how many planes agree, and what came of it."""

@@ -14,6 +14,7 @@ from mapstream.operators.lidar.places.place_matcher import ACCEPTED
 from mapstream.operators.operator import Operator, Placement, offload, warn
 from mapstream.operators.places.drift import DriftConfig
 from mapstream.operators.places.following import Following
+from mapstream.operators.places.map_poses import send_pose
 from mapstream.recordings.maps import load_map
 from mapstream.streams.channel import Receiver, Sender
 from mapstream.streams.messages.estimates import MapPose, Odometry, PointCloud
@@ -70,7 +71,8 @@ class LocalizeLidar(Operator[Inputs, Outputs]):
         self._map = await offload(self._opened)
         async for _, message in merge(inputs.odometry, inputs.clouds, delays_ns=(0, self._late_ns)):
             if isinstance(message, Odometry):
-                await self._send(outputs, await offload(self.follow, message))
+                pose = await offload(self.follow, message)
+                await send_pose(pose, outputs.poses, outputs.odometry)
             elif self._is_due(message):
                 self._waiting.append(message)
         if not self._following.has_tracked:
@@ -85,13 +87,6 @@ class LocalizeLidar(Operator[Inputs, Outputs]):
             return False
         self._compared_ns = cloud.stamp_ns
         return True
-
-    async def _send(self, outputs: Outputs, pose: MapPose) -> None:
-        await outputs.poses.send(pose)
-        if pose.T_map_base is None:
-            outputs.odometry.advance(pose.stamp_ns)
-            return
-        await outputs.odometry.send(Odometry(stamp_ns=pose.stamp_ns, T_odom_base=pose.T_map_base))
 
     def follow(self, odometry: Odometry) -> MapPose:
         """Return where the robot is at this moment of its odometry, after the clouds until then."""
