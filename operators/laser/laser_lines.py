@@ -12,6 +12,7 @@ from pydantic import Field, NonNegativeFloat
 from mapstream.operators.laser.beams import beam_ends
 from mapstream.operators.laser.lines import LineConfig, Lines, find_lines
 from mapstream.operators.operator import Operator, OperatorConfig, Placement, offload, warn
+from mapstream.operators.period import Spacing
 from mapstream.streams.channel import Receiver, Sender
 from mapstream.streams.messages.estimates import Odometry
 from mapstream.streams.messages.planes import PlaneSegments
@@ -50,24 +51,17 @@ class LaserLines(Operator[Inputs, Outputs]):
 
     def __init__(self, config: LaserLinesConfig) -> None:
         self._config = config
-        self._looked_ns: int | None = None
+        self._spacing = Spacing(config.period_s)
 
     async def run(self, inputs: Inputs, outputs: Outputs) -> None:
         way = window(inputs.odometry, optional=True)
         async for scan, odometry in anchored(inputs.laser, way):
-            if not self._is_due(scan):
+            if not self._spacing.allows(scan.stamp_ns):
                 outputs.planes.advance(scan.stamp_ns)
                 continue
             if inputs.odometry is not None and odometry is None:
                 warn("scans of a time without odometry; the robot counts as standing")
             await outputs.planes.send(await offload(self.find, scan, odometry or ()))
-
-    def _is_due(self, scan: LaserScan2D) -> bool:
-        since_ns = self._config.period_s * 1e9
-        if self._looked_ns is not None and scan.stamp_ns - self._looked_ns < since_ns:
-            return False
-        self._looked_ns = scan.stamp_ns
-        return True
 
     def find(self, scan: LaserScan2D, odometry: Sequence[Odometry] = ()) -> PlaneSegments:
         """Return the walls of one scan, seen from the base at the end of its sweep.

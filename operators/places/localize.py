@@ -9,6 +9,7 @@ from typing import ClassVar
 from pydantic import Field, NonNegativeFloat
 
 from mapstream.operators.operator import Operator, OperatorConfig, Placement, offload, warn
+from mapstream.operators.period import Spacing
 from mapstream.operators.places.drift import DriftConfig
 from mapstream.operators.places.following import Following
 from mapstream.operators.places.map_places import MapPlaces
@@ -65,14 +66,14 @@ class Localize(Operator[Inputs, Outputs]):
         self._places: MapPlaces | None = None
         self._late_ns = round(config.late_s * 1e9)
         self._following = Following(config.drift, self._late_ns)
-        self._compared_ns: int | None = None
+        self._spacing = Spacing(config.period_s)
         self._waiting: list[NFrame] = []  # for the odometry of their time
 
     async def run(self, inputs: Inputs, outputs: Outputs) -> None:
         self._places = await offload(self._opened)
         if inputs.odometry is None:
             async for frame in inputs.n_frames:
-                if self._is_due(frame):
+                if self._spacing.allows(frame.stamp_ns):
                     pose = await offload(self.locate, frame)
                     await send_pose(pose, outputs.poses, outputs.odometry)
             return
@@ -82,20 +83,13 @@ class Localize(Operator[Inputs, Outputs]):
             if isinstance(message, Odometry):
                 pose = await offload(self.follow, message)
                 await send_pose(pose, outputs.poses, outputs.odometry)
-            elif self._is_due(message):
+            elif self._spacing.allows(message.stamp_ns):
                 self._waiting.append(message)
         if not self._following.has_tracked:
             warn("the robot was never found in the map")
 
     def _opened(self) -> MapPlaces:
         return MapPlaces(load_map(self._config.map), self._config.recognition)
-
-    def _is_due(self, frame: NFrame) -> bool:
-        since_s = self._config.period_s
-        if self._compared_ns is not None and frame.stamp_ns - self._compared_ns < since_s * 1e9:
-            return False
-        self._compared_ns = frame.stamp_ns
-        return True
 
     def locate(self, frame: NFrame) -> MapPose:
         """Return where one frame was taken, by itself."""

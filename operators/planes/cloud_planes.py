@@ -11,8 +11,8 @@ from pydantic import NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveIn
 
 from mapstream.operators.lidar.sampling import usable
 from mapstream.operators.operator import Operator, OperatorConfig, Placement, offload
+from mapstream.operators.period import Period
 from mapstream.operators.planes.oriented_points import oriented_points
-from mapstream.operators.planes.period import Period
 from mapstream.operators.planes.ransac import CloudPlane, RansacLimits, cloud_planes
 from mapstream.recordings.maps.hulls import convex_hull
 from mapstream.streams.arrays import FloatArray

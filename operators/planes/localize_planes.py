@@ -11,10 +11,10 @@ import numpy as np
 from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
 
 from mapstream.operators.operator import Operator, OperatorConfig, Placement, offload, warn
+from mapstream.operators.period import Period
 from mapstream.operators.places.drift import Drift, DriftConfig, Fix
 from mapstream.operators.places.map_poses import MapPoses, send_pose
 from mapstream.operators.planes.known_planes import KnownPlanes, Reach
-from mapstream.operators.planes.period import Period
 from mapstream.operators.planes.plane_evidence import KnownOutlines, samples_of
 from mapstream.operators.planes.plane_pose import PlaneNoise, pose_covariance, pose_from_planes
 from mapstream.operators.planes.plane_search import (

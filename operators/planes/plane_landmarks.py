@@ -18,8 +18,8 @@ from mapstream.operators.operator import (
     report_loss,
     warn,
 )
+from mapstream.operators.period import Period
 from mapstream.operators.planes.known_planes import KnownPlanes, Reach
-from mapstream.operators.planes.period import Period
 from mapstream.operators.planes.seen_plane import SeenPlane
 from mapstream.operators.planes.whereabouts import Whereabouts
 from mapstream.recordings.maps.hulls import hull_payload

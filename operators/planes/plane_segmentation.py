@@ -12,10 +12,10 @@ from mapstream.operators.images.calibrated import require_camera
 from mapstream.operators.images.depth import depth_m_of
 from mapstream.operators.images.pinhole_maps import calibration_key
 from mapstream.operators.operator import Operator, OperatorConfig, Placement, offload, pipeline
+from mapstream.operators.period import Period
 from mapstream.operators.planes.depth_planes import SegmentationLimits, depth_planes
 from mapstream.operators.planes.image_planes import ImagePlanes
 from mapstream.operators.planes.local_planes import DepthGrid
-from mapstream.operators.planes.period import Period
 from mapstream.operators.planes.plane_axes import plane_covariance, pose_on
 from mapstream.operators.planes.regions import Labels
 from mapstream.recordings.maps.hulls import convex_hull

@@ -12,6 +12,7 @@ from pydantic import Field, NonNegativeFloat
 from mapstream.operators.lidar.places.map_clouds import Located, MapClouds, MapCloudsConfig
 from mapstream.operators.lidar.places.place_matcher import ACCEPTED
 from mapstream.operators.operator import Operator, Placement, offload, warn
+from mapstream.operators.period import Spacing
 from mapstream.operators.places.drift import DriftConfig
 from mapstream.operators.places.following import Following
 from mapstream.operators.places.map_poses import send_pose
@@ -64,7 +65,7 @@ class LocalizeLidar(Operator[Inputs, Outputs]):
         self._late_ns = round(config.late_s * 1e9)
         self._following = Following(config.drift, self._late_ns)
         self._map: MapClouds | None = None
-        self._compared_ns: int | None = None
+        self._spacing = Spacing(config.period_s)
         self._waiting: list[PointCloud] = []  # for the odometry of their time
 
     async def run(self, inputs: Inputs, outputs: Outputs) -> None:
@@ -73,20 +74,13 @@ class LocalizeLidar(Operator[Inputs, Outputs]):
             if isinstance(message, Odometry):
                 pose = await offload(self.follow, message)
                 await send_pose(pose, outputs.poses, outputs.odometry)
-            elif self._is_due(message):
+            elif self._spacing.allows(message.stamp_ns):
                 self._waiting.append(message)
         if not self._following.has_tracked:
             warn("the robot was never found in the map")
 
     def _opened(self) -> MapClouds:
         return MapClouds(load_map(self._config.map), self._config.map, self._config)
-
-    def _is_due(self, cloud: PointCloud) -> bool:
-        since_s = self._config.period_s
-        if self._compared_ns is not None and cloud.stamp_ns - self._compared_ns < since_s * 1e9:
-            return False
-        self._compared_ns = cloud.stamp_ns
-        return True
 
     def follow(self, odometry: Odometry) -> MapPose:
         """Return where the robot is at this moment of its odometry, after the clouds until then."""
