@@ -91,8 +91,8 @@ def remove_moving(
     paths, num_points, num_moving = [], 0, 0
     with CloudStore(folder / CLOUDS, max_bytes=0) as store:
         for number, row in enumerate(rows.tolist()):
-            cloud = read_cloud(folder / map_.resources.path[row])
-            is_moving = scene.is_moving(number)
+            cloud = scene.cloud(number)
+            is_moving = scene.is_moving(number, cloud)
             key = f"static-{map_.vertices.id[map_.resources.vertex[row]].tobytes().hex()}"
             store.put(key, _kept(cloud, ~is_moving))
             paths.append(f"{CLOUDS}/{store.path_of(key).name}")
@@ -116,12 +116,18 @@ class _Scene:
         self._places = {m: lidar_place(map_, m) for m in np.unique(self._missions).tolist()}
         begins = {m: int(map_.vertices.stamp_ns[map_.vertices_of(m)].min()) for m in self._places}
         self._begin_ns = np.array([begins[m] for m in self._missions.tolist()])
-        self._middles = np.array([self._view(n).points.mean(axis=0) for n in range(len(rows))])
+        self._middles = np.array(
+            [self._view(n, self.cloud(n)).points.mean(axis=0) for n in range(len(rows))]
+        )
         self._ranges = lru_cache(maxsize=_MAX_IMAGES)(self._ranges_from)
 
-    def is_moving(self, number: int) -> BoolArray:
+    def cloud(self, number: int) -> PointCloud:
+        """Return a cloud as it is stored."""
+        return read_cloud(self._folder / self._map.resources.path[self._rows[number]])
+
+    def is_moving(self, number: int, cloud: PointCloud) -> BoolArray:
         """Return which points (N,) of a cloud others looked through."""
-        view, config = self._view(number), self._config
+        view, config = self._view(number, cloud), self._config
         away_m = np.linalg.norm(view.points - view.origin, axis=1)
         is_moving = np.zeros(len(view.points), np.bool_)
         for mission in self._judges(number):
@@ -148,10 +154,9 @@ class _Scene:
         judges: list[int] = np.unique(self._missions[is_judge]).tolist()
         return judges
 
-    def _view(self, number: int) -> _View:
+    def _view(self, number: int, cloud: PointCloud) -> _View:
         row = self._rows[number]
         vertex = int(self._map.resources.vertex[row])
-        cloud = read_cloud(self._folder / self._map.resources.path[row])
         T = self._map.T_map_base(np.array([vertex]))[0]
         place = self._places[int(self._missions[number])]
         points = cloud.points.astype(np.float64) @ T[:3, :3].T + T[:3, 3]
@@ -159,7 +164,7 @@ class _Scene:
 
     def _ranges_from(self, number: int) -> tuple[Float32Array, FloatArray]:
         """Return the nearest range by elevation and azimuth from a cloud's own place; infinite: nothing seen."""
-        view = self._view(number)
+        view = self._view(number, self.cloud(number))
         cells, range_m = self._cells(view.points - view.origin)
         nearest_m = np.full(self._shape(), np.inf, np.float32)
         np.minimum.at(nearest_m, cells, range_m.astype(np.float32))

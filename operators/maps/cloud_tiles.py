@@ -15,7 +15,7 @@ import numpy as np
 from pydantic import PositiveFloat
 
 from mapstream.operators.maps.aggregate import AggregateConfig, placed_clouds
-from mapstream.operators.maps.geo_clouds import georeferenced
+from mapstream.operators.maps.geo_clouds import projection_of
 from mapstream.operators.maps.voxels import Voxels
 from mapstream.recordings.las_files import write_las
 from mapstream.recordings.maps.folder import write_whole
@@ -55,24 +55,24 @@ def write_tiles(map_: Map, folder: Path, out: Path, config: TilesConfig) -> Tile
     Raises:
         MapError: If the map has no clouds, or a file cannot be written.
     """
+    projection = projection_of(map_, config.crs)
     out.mkdir(parents=True, exist_ok=True)
-    crs, wkt = "", ""
     with TemporaryDirectory(prefix="tiles-", dir=out) as spool:
         for points_map, cloud in placed_clouds(
             map_, folder, with_unanchored=config.with_unanchored
         ):
-            placed = georeferenced(map_, points_map, config.crs)
-            crs, wkt = placed.crs, placed.wkt
-            _spool(placed.points, cloud, Path(spool), config.tile_m)
+            _spool(projection.place(points_map), cloud, Path(spool), config.tile_m)
         waiting = sorted(Path(spool).iterdir())
-        entries = [_write_tile(file, out, config, wkt) for file in waiting]
-    index = {"crs": crs, "tile_m": config.tile_m, "tiles": entries}
+        entries = [_write_tile(file, out, config, projection.wkt) for file in waiting]
+    index = {"crs": projection.crs, "tile_m": config.tile_m, "tiles": entries}
     try:
         write_whole(out / INDEX, json.dumps(index, indent=1, sort_keys=True).encode())
     except OSError as error:
         raise MapError(f"{out / INDEX}: cannot be written: {error}") from error
     files = (out / INDEX, *(out / entry["file"] for entry in entries))
-    return TilesReport(files=files, num_points=sum(e["num_points"] for e in entries), crs=crs)
+    return TilesReport(
+        files=files, num_points=sum(e["num_points"] for e in entries), crs=projection.crs
+    )
 
 
 def _spool(points: FloatArray, cloud: PointCloud, spool: Path, tile_m: float) -> None:

@@ -16,7 +16,7 @@ import numpy.typing as npt
 from pydantic import Field, NonNegativeInt, PositiveFloat
 
 from mapstream.operators.maps.aggregate import AggregateConfig, aggregate_cloud
-from mapstream.operators.maps.geo_clouds import georeferenced
+from mapstream.operators.maps.geo_clouds import projection_of
 from mapstream.recordings.maps.folder import write_whole
 from mapstream.recordings.maps.model import Map
 from mapstream.streams.arrays import Float32Array, FloatArray
@@ -62,8 +62,9 @@ def elevation(map_: Map, folder: Path, config: ElevationConfig) -> Elevation:
         MapError: If the map has no clouds, or is too large for cells of this size.
     """
     cloud = aggregate_cloud(map_, folder, config)
-    placed = georeferenced(map_, cloud.points.astype(np.float64), config.crs)
-    return elevation_of(placed.points, cloud.colors_rgba, config, placed.wkt)
+    projection = projection_of(map_, config.crs)
+    points = projection.place(cloud.points.astype(np.float64))
+    return elevation_of(points, cloud.colors_rgba, config, projection.wkt)
 
 
 def elevation_of(

@@ -12,7 +12,7 @@ import numpy as np
 from mapstream.operators.maps.aggregate import AggregateConfig, aggregate_cloud
 from mapstream.operators.maps.colmap import colmap_model
 from mapstream.operators.maps.csv_tables import write_tables
-from mapstream.operators.maps.geo_clouds import georeferenced
+from mapstream.operators.maps.geo_clouds import projection_of
 from mapstream.recordings.cloud_files import write_pcd, write_ply
 from mapstream.recordings.colmap import write_model
 from mapstream.recordings.g2o import write_g2o
@@ -125,10 +125,11 @@ def _pcd(map_: Map, folder: Path, path: Path, config: ExportConfig) -> ExportRep
 
 def _las(map_: Map, folder: Path, path: Path, config: ExportConfig) -> ExportReport:
     cloud = aggregate_cloud(map_, folder, config)
-    placed = georeferenced(map_, cloud.points.astype(np.float64), config.crs)
-    write_las(path, placed.points, cloud.intensity, cloud.colors_rgb, placed.wkt)
+    projection = projection_of(map_, config.crs)
+    points = projection.place(cloud.points.astype(np.float64))
+    write_las(path, points, cloud.intensity, cloud.colors_rgb, projection.wkt)
     return ExportReport(
-        files=(path,), written={f"points in {placed.crs or 'the map frame'}": len(cloud.points)}
+        files=(path,), written={f"points in {projection.crs or 'the map frame'}": len(cloud.points)}
     )
 
 
