@@ -224,7 +224,8 @@ class ReplayClock:
         if self._is_paused:
             await self._changed.wait()
             return
-        left_s = (stamp_ns - self.now_ns()) / 1e9 / (self._rate or 1.0)
+        left_ns = max(0, stamp_ns - self.now_ns())  # time went on since it was looked at
+        left_s = left_ns / 1e9 / (self._rate or 1.0)
         is_held = self._auto is not None and self._auto.is_full()
         if self._auto is not None:
             left_s = _POLL_S if is_held else min(left_s, _SLICE_S)

@@ -3,6 +3,7 @@
 from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import asynccontextmanager
 from dataclasses import dataclass, field
+from itertools import count
 
 import anyio
 import anyio.lowlevel
@@ -264,3 +265,20 @@ async def test_B2_the_wall_clock_does_not_wait_for_the_past() -> None:
     clock: Clock = WallClock()
 
     await clock.sleep_until(clock.now_ns() - SECOND)
+
+
+async def test_a_deadline_that_passes_while_one_looks_at_it_is_not_slept_for() -> None:
+    """Each look takes a while, so that the time is later than it was when the deadline was still ahead."""
+    looks = count(0, 30_000_000)
+    slept_s: list[float] = []
+
+    async def sleep(seconds: float) -> None:
+        slept_s.append(seconds)
+        await anyio.lowlevel.checkpoint()
+
+    clock = ReplayClock(monotonic_ns=lambda: next(looks), sleep=sleep)
+    for number in range(20):
+        await clock.sleep_until(number * SECOND // 10)
+
+    assert slept_s
+    assert min(slept_s) >= 0
