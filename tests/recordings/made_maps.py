@@ -9,9 +9,11 @@ from pathlib import Path
 import numpy as np
 
 from mapstream.recordings.maps.build import append_edges
+from mapstream.recordings.maps.detections import rows_of
 from mapstream.recordings.maps.ids import derived_id, id_array
 from mapstream.recordings.maps.model import Map
 from mapstream.recordings.maps.projections import DescriptorProjection, with_projection
+from mapstream.recordings.maps.semantic_tables import Regions
 from mapstream.recordings.maps.submaps import append_submap
 from mapstream.recordings.maps.tables import (
     Edges,
@@ -29,6 +31,7 @@ from mapstream.streams.messages.estimates import (
     RelativePose,
     Submap,
 )
+from mapstream.streams.messages.objects import ObjectDetections
 from mapstream.streams.messages.sensors import RecordRef
 
 MISSION, OTHER_MISSION = "0f" * 16, "a0" * 16
@@ -121,7 +124,8 @@ def full_map() -> Map:
         landmark=np.array([0, 0, 2, 3, -1]),
         sensor=np.array(["camera", "camera", "lidar", "camera", "camera"], dtype=object),
         keypoint_px=np.ones((5, 2), dtype=np.float32),
-        kind=np.array(["orb", "sift", "", "", ""], dtype=object),
+        kind=np.array(["orb", "sift", "", "object", ""], dtype=object),
+        label=np.array(["", "", "", "chair", ""], dtype=object),
         track=np.array([7, -1, -1, -1, -1]),
         feature_set=np.array([0, 1, -1, -1, -1]),
         feature=np.array([0, 1, -1, -1, -1]),
@@ -139,6 +143,25 @@ def full_map() -> Map:
         feature_sets=feature_sets,
         observations=observations,
     )
+    objects = ObjectDetections(
+        stamp_ns=0,
+        frame="camera",
+        width_px=64,
+        height_px=48,
+        boxes_px=np.array([[2.2, 3.0, 8.0, 9.5]], np.float32),
+        labels=("chair",),
+        scores=np.ones(1, np.float32),
+        masks=(np.eye(7, 7, dtype=bool),),
+        mask_sources=("depth",),
+        points_m=(np.ones((5, 3), np.float32),),
+    )
+    regions = Regions(
+        id=id_array([derived_id("region", "room", "hall")]),
+        name=np.array(["hall"], dtype=object),
+        vertex=np.array([1]),
+        outline=np.array([np.zeros((3, 3)).tobytes()], dtype=object),
+    )
+    map_ = replace(map_, detections=rows_of(objects, 3), regions=regions)
     mean, matrix = np.zeros(2, np.float32), np.ones((2, 1), np.float32)
     map_ = with_projection(map_, DescriptorProjection("sift", "compression", mean, matrix))
     fix = Edges(

@@ -26,6 +26,7 @@ from mapstream.streams.messages.estimates import (
     Submap,
 )
 from mapstream.streams.messages.grids import OccupancyGrid
+from mapstream.streams.messages.objects import ObjectDetections
 from mapstream.streams.messages.planes import PlaneSegments
 from mapstream.streams.messages.sensors import (
     CameraFrame,
@@ -119,12 +120,23 @@ def one_of_each(seed: int) -> list[Any]:
         stamp_ns=stamp, width_px=640, height_px=480, focal_px=rng.random(2) + 400,
         center_px=rng.random(2) + 200, distortion="radtan", distortion_parameters=rng.random(4),
     )  # fmt: skip
+    objects = ObjectDetections(
+        stamp_ns=stamp, frame="camera", width_px=64, height_px=48,
+        boxes_px=np.tile(np.array([[1.0, 2.0, 4.0, 4.4]], np.float32), (n, 1)), labels=("cup",) * n,
+        scores=rng.random(n).astype(np.float32), masks=(np.eye(4, 4, dtype=bool)[1:],) * n,
+        mask_sources=("depth",) * n, points_m=(rng.random((2, 3)).astype(np.float32),) * n,
+        centers_m=maybe(rng.random((n, 3)).astype(np.float32)), center_sigmas_m=maybe(np.ones(n, np.float32)),
+        quats_camera_object_xyzw=maybe(np.ones((n, 4)) / 2), extents_m=maybe(np.ones((n, 3), np.float32)),
+        texts=("exit",) * n, descriptors=maybe(np.ones((n, 4), np.float32)), descriptor_kind="vlad",
+        track_ids=maybe(np.arange(n)), T_base_sensor=pose(), camera=maybe(camera), record=maybe(ref),
+    )  # fmt: skip
     features = ImageFeatures(
         stamp_ns=stamp, kind="orb", frame="camera",
         keypoints_px=rng.random((n, 2)).astype(np.float32),
         descriptors=rng.integers(0, 255, (n, 32), np.uint8), scores=maybe(intensity),
         sigmas_px=maybe(intensity), track_ids=maybe(np.arange(n) - 1),
         points_m=maybe(rng.random((n, 3)).astype(np.float32)), offsets_ns=maybe(np.arange(n)),
+        objects=maybe(objects),
         T_base_sensor=pose(), camera=maybe(camera), record=maybe(ref),
     )  # fmt: skip
     return [
@@ -185,7 +197,7 @@ def one_of_each(seed: int) -> list[Any]:
             hulls_m=tuple(rng.random((k + 2, 2)) for k in range(n)),
             num_points=np.arange(n), rmse_m=rng.random(n), T_base_sensor=pose(),
         ),
-        features,
+        features, objects,
         NFrame(stamp_ns=stamp, features=(features,) * n),
         GlobalDescriptor(stamp_ns=stamp, kind="vlad", frame="camera", vector=np.ones(4, np.float32)),
     ]  # fmt: skip
