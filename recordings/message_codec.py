@@ -35,7 +35,15 @@ from mapstream.recordings.message_schema import (
 from mapstream.streams import calibration
 from mapstream.streams.errors import DecodeError
 from mapstream.streams.geometry import SE3
-from mapstream.streams.messages import constraints, estimates, grids, planes, sensors, vision
+from mapstream.streams.messages import (
+    constraints,
+    estimates,
+    grids,
+    objects,
+    planes,
+    sensors,
+    vision,
+)
 from mapstream.streams.messages.sensors import Message
 
 _ARRAY_KINDS: Final = "biuf"  # no objects: a file must not be able to name code
@@ -114,7 +122,9 @@ def known_messages() -> dict[str, type[Any]]:
     """Return message classes by name."""
     known = {
         name: cls
-        for module in (sensors, constraints, estimates, grids, planes, vision, calibration)
+        for module in (
+            sensors, constraints, estimates, grids, objects, planes, vision, calibration
+        )
         for name, cls in vars(module).items()
         if isinstance(cls, type) and is_dataclass(cls) and cls.__module__ == module.__name__
     }

@@ -12,6 +12,7 @@ import numpy as np
 
 from mapstream.operators.landmarks.locating import FOUND, LocateConfig, Located, locate
 from mapstream.operators.landmarks.sensors import numbered
+from mapstream.recordings.maps.columns import TextArray
 from mapstream.recordings.maps.ids import derived_id, id_array
 from mapstream.recordings.maps.model import Map
 from mapstream.recordings.maps.rows import concatenate
@@ -37,6 +38,7 @@ def create_landmarks(map_: Map, config: LocateConfig | None = None) -> tuple[Map
     first = np.flatnonzero(np.append(True, group[1:] != group[:-1])) if len(group) else group
     first_rows = rows[first]
     added = _landmarks(map_, first_rows[is_found], located, is_found)
+    added = replace(added, label=_labels(map_, rows, group)[is_found])
     number = np.cumsum(is_found) - 1 + len(map_.landmarks)
     landmark = map_.observations.landmark.copy()
     landmark[rows] = np.where(is_found[group], number[group], -1)
@@ -104,6 +106,17 @@ def _landmarks(map_: Map, first: IntArray, located: Located, chosen: BoolArray) 
         p_base=p_base,
         covariance=covariance,
     )
+
+
+def _labels(map_: Map, rows: IntArray, group: IntArray) -> TextArray:
+    """Return the class (G,) that most observations of each group have; of several the first by name."""
+    labels, number = np.unique(map_.observations.label[rows].astype(str), return_inverse=True)
+    if not len(labels):
+        return np.empty(0, object)
+    votes = np.zeros((int(group[-1]) + 1, len(labels)), np.int64)
+    np.add.at(votes, (group, number), 1)
+    chosen: TextArray = labels.astype(object)[votes.argmax(axis=1)]
+    return chosen
 
 
 def _in_base(

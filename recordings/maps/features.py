@@ -15,8 +15,10 @@ import numpy.typing as npt
 
 from mapstream.recordings.maps.cameras import Camera, cameras_of, with_cameras
 from mapstream.recordings.maps.columns import BytesArray, TextArray
+from mapstream.recordings.maps.detections import rows_of
 from mapstream.recordings.maps.model import Map
 from mapstream.recordings.maps.rows import concatenate
+from mapstream.recordings.maps.semantic_tables import Detections
 from mapstream.recordings.maps.tables import FeatureSets, Observations
 from mapstream.streams.arrays import Float32Array, IntArray
 from mapstream.streams.errors import MapError
@@ -45,6 +47,8 @@ def add_features(
         return map_
     described: list[tuple[int, int, ImageFeatures]] = []
     observed: list[Observations] = []
+    detected: list[Detections] = []
+    num_observed = len(map_.observations)
     for vertex, stamp_ns, features in seen:
         if features.descriptors.dtype.name not in _DTYPES:
             found = f"{features.descriptors.dtype.name} of kind {features.kind}"
@@ -54,10 +58,14 @@ def add_features(
             feature_set = len(map_.feature_sets) + len(described)
             described.append((vertex, stamp_ns, features))
         observed.append(_observations(vertex, stamp_ns, features, feature_set))
+        if features.objects is not None:
+            detected.append(rows_of(features.objects, num_observed))
+        num_observed += len(features)
     map_ = replace(
         map_,
         feature_sets=concatenate([map_.feature_sets, _feature_sets(described)]),
         observations=concatenate([map_.observations, *observed]),
+        detections=concatenate([map_.detections, *detected]),
     )
     known = cameras_of(map_, mission_row)
     new = {
@@ -150,6 +158,7 @@ def _observations(
         kind=_texts([features.kind] * n),
         offset_ns=features.stamp_ns - stamp_ns + offsets_ns,
         keypoint_px=features.keypoints_px,
+        label=_texts([""] * n if features.objects is None else features.objects.labels),
         sigma=_or(features.sigmas_px, n, KEYPOINT_SIGMA_PX),
         track=np.full(n, -1) if features.track_ids is None else features.track_ids,
         feature_set=np.full(n, feature_set),

@@ -16,7 +16,7 @@ from mapstream.recordings.maps.model import TABLES
 from mapstream.streams.errors import MapFormatError
 
 IDENTIFIER = "mapstream map"
-VERSION = 3
+VERSION = 4
 MANIFEST = "manifest.json"
 TABLES_FOLDER = "tables"
 _FILE = re.compile(r"tables/[a-z_]+-[0-9a-f]{16}\.arrow")

@@ -17,6 +17,7 @@ import numpy.typing as npt
 from mapstream.recordings.maps.columns import Table
 from mapstream.recordings.maps.ids import as_keys, id_array, id_bytes, vertex_id
 from mapstream.recordings.maps.rows import select, table_digest
+from mapstream.recordings.maps.semantic_tables import Detections, Regions
 from mapstream.recordings.maps.tables import (
     Edges,
     FeatureSets,
@@ -48,6 +49,8 @@ class Map:
     imu: ImuSamples = field(default_factory=ImuSamples)
     feature_sets: FeatureSets = field(default_factory=FeatureSets)
     observations: Observations = field(default_factory=Observations)
+    detections: Detections = field(default_factory=Detections)
+    regions: Regions = field(default_factory=Regions)
     resources: Resources = field(default_factory=Resources)
     projections: Projections = field(default_factory=Projections)
     journal: Journal = field(default_factory=Journal)

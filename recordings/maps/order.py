@@ -35,6 +35,8 @@ def in_canonical_order(map_: Map) -> Map:
     seen = map_.observations
     by_feature = np.lexsort((seen.feature, seen.feature_set, seen.vertex))
     map_ = _with_rows(map_, "observations", by_feature)
+    map_ = _with_rows(map_, "detections", np.argsort(map_.detections.observation, kind="stable"))
+    map_ = _with_rows(map_, "regions", np.argsort(as_keys(map_.regions.id), kind="stable"))
     return _with_rows(map_, "resources", np.argsort(map_.resources.vertex, kind="stable"))
 
 

@@ -128,6 +128,12 @@ def imu_samples_are_in_order(map_: Map) -> Iterable[Finding]:
     yield from where(broken, "imu", "not after the sample before it of the same edge")
 
 
+def detections_are_of_objects(map_: Map) -> Iterable[Finding]:
+    """What a detection tells more of is an observation of kind object."""
+    other = map_.observations.kind[map_.detections.observation] != "object"
+    yield from where(other, "detections", "its observation is not of kind object")
+
+
 def missions_are_connected(map_: Map) -> Iterable[Finding]:
     """Edges within a mission join all of its vertices."""
     component = components(map_)
@@ -165,5 +171,6 @@ STRUCTURE_RULES: tuple[Rule, ...] = (
     imu_edges_join_neighbours,
     imu_samples_belong_to_imu_edges,
     imu_samples_are_in_order,
+    detections_are_of_objects,
     missions_are_connected,
 )

@@ -103,7 +103,11 @@ class Landmarks(Table):
     )
     covariance: FloatArray = column("float64", "of `p_base` [m^2]; NaN: unknown", (3, 3), fill=_NAN)
     quality: TextArray = column("text", "unknown, bad or good", fill="unknown")
-    payload: BytesArray = column("bytes", "what a kind needs beyond this", fill=b"")
+    payload: BytesArray = column(
+        "bytes",
+        "what a kind needs beyond this; of objects JSON: extent_m, text, and name, which people gave",
+        fill=b"",
+    )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -229,6 +233,7 @@ class Observations(Table):
     kind: TextArray = column(
         "text", "of the feature; landmarks and tracks are of one kind", fill=""
     )
+    label: TextArray = column("text", "semantic class of what was seen", fill="")
     track: IntArray = column(
         "int64",
         "keypoints of a mission and kind with one track are of one point; -1: none",

@@ -221,6 +221,28 @@ def projections_are_whole(map_: Map) -> Iterable[Finding]:
     yield from where(unknown, "projections", lambda row: f"a projection for {table.use[row]!r}")
 
 
+def detections_are_whole(map_: Map) -> Iterable[Finding]:
+    """A detection has a box in an image, and whole points."""
+    table = map_.detections
+    is_box = np.isfinite(table.box_px).all(axis=1) & (table.image_px > 0).all(axis=1)
+    is_box &= (table.box_px[:, 2:] >= table.box_px[:, :2]).all(axis=1)
+    yield from where(np.asarray(~is_box), "detections", "its box is not one")
+    cut = np.array([len(data) % 12 > 0 for data in table.points], dtype=bool)
+    yield from where(cut, "detections", "its points are not whole")
+
+
+def regions_are_whole(map_: Map) -> Iterable[Finding]:
+    """A region has a name, and corners that are finite."""
+    table = map_.regions
+    yield from where(table.name == "", "regions", "it has no name")
+    broken = [
+        not data or len(data) % 24 > 0 or not np.isfinite(np.frombuffer(data, "<f8")).all()
+        for data in table.outline
+    ]
+    found = np.array(broken, dtype=bool)
+    yield from where(found, "regions", "its outline is not finite, or not whole")
+
+
 def texts_are_json(map_: Map) -> Iterable[Finding]:
     """Sensor sets and parameters of the journal are JSON objects."""
     for table, texts in (
@@ -269,6 +291,8 @@ VALUE_RULES: tuple[Rule, ...] = (
     observations_have_an_uncertainty,
     feature_sets_are_whole,
     projections_are_whole,
+    detections_are_whole,
+    regions_are_whole,
     texts_are_json,
     resources_stay_in_the_folder,
 )

@@ -11,6 +11,7 @@ import numpy.typing as npt
 from mapstream.streams.arrays import Float32Array, IntArray, frozen, frozen_optional
 from mapstream.streams.calibration import CameraCalibration
 from mapstream.streams.geometry import SE3
+from mapstream.streams.messages.objects import ObjectDetections
 from mapstream.streams.messages.sensors import RecordRef
 
 NO_TRACK = -1
@@ -42,6 +43,7 @@ class ImageFeatures:
     points_m: Float32Array | None = None  # (N, 3) in the sensor's frame; NaN: only a ray is known
     point_sigmas_m: Float32Array | None = None  # (N,)
     offsets_ns: IntArray | None = None  # (N,) time of each keypoint after stamp_ns
+    objects: ObjectDetections | None = None  # of kind `object`: N of them, each keypoint its middle
     T_base_sensor: SE3 = field(default_factory=SE3.identity)
     camera: CameraCalibration | None = None
     record: RecordRef | None = None  # the image, where it lies
@@ -57,6 +59,8 @@ class ImageFeatures:
         frozen_optional(self, "points_m", np.float32, (n, 3))
         frozen_optional(self, "track_ids", np.int64, (n,))
         frozen_optional(self, "offsets_ns", np.int64, (n,))
+        if self.objects is not None and len(self.objects) != n:
+            raise ValueError(f"ImageFeatures: {n} keypoints of {len(self.objects)} objects")
 
     def __len__(self) -> int:
         return len(self.keypoints_px)
