@@ -73,6 +73,7 @@ BUILT_IN = {
     "mesh_sink": "mapstream.operators.sinks.mesh:MeshSink",
     "n_frames": "mapstream.operators.tracking.n_frames:NFrames",
     "network_tracker": "mapstream.operators.networks.network_tracker:NetworkTracker",
+    "object_features": "mapstream.operators.objects.object_features:ObjectFeatures",
     "occupancy_grid": "mapstream.operators.laser.occupancy_grid:OccupancyGrids",
     "odometry_adapter": "mapstream.operators.odometry.odometry_adapter:OdometryAdapter",
     "odometry_file": "mapstream.operators.sources.odometry_file:OdometryFile",

@@ -1,0 +1,1 @@
+"""Objects: detected, described, tracked, mapped, and what people call them."""
