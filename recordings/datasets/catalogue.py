@@ -18,6 +18,7 @@ from mapstream.recordings.datasets.mines import convert_mines
 from mapstream.recordings.datasets.pcd_folder import convert_pcd_folder
 from mapstream.recordings.datasets.rawlog import convert_rawlog
 from mapstream.recordings.datasets.seven_scenes import convert_seven_scenes
+from mapstream.recordings.datasets.tum_objects import convert_tum_objects, has_objects
 from mapstream.recordings.datasets.tum_rgbd import convert_tum_rgbd
 from mapstream.recordings.mcap_whole import whole_mcap
 from mapstream.recordings.mcap_writer import McapWriter
@@ -55,8 +56,11 @@ def convert_rosbag(source: Path, writer: McapWriter, on_progress: Progress) -> N
 
 
 def convert_tum(source: Path, writer: McapWriter, on_progress: Progress) -> Notices:
-    """Write a folder of colour and depth, or a trajectory."""
-    return (convert_tum_rgbd if source.is_dir() else convert_odometry)(source, writer, on_progress)
+    """Write a folder of colour and depth, or of detected objects, or a trajectory."""
+    if not source.is_dir():
+        return convert_odometry(source, writer, on_progress)
+    of_folder = convert_tum_objects if has_objects(source) else convert_tum_rgbd
+    return of_folder(source, writer, on_progress)
 
 
 CONVERTERS = {

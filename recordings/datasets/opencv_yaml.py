@@ -1,11 +1,14 @@
-"""YAML as OpenCV writes it, whose first line is none."""
+"""YAML as OpenCV writes it, whose first line is none, and as it reads it, with `key:value` in one word."""
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 from mapstream.streams.errors import RecordingError
 from mapstream.streams.fields import Fields
+
+_KEY = re.compile(rb"^(\s*[\w.]+:)(?=[^\s:])", re.MULTILINE)
 
 
 def read_opencv_yaml(path: Path) -> Fields:
@@ -19,4 +22,5 @@ def read_opencv_yaml(path: Path) -> Fields:
         content = path.read_bytes()
     except OSError as error:
         raise RecordingError(f"{path}: cannot be read: {error}") from error
-    return Fields.of_bytes(b"#" + content if content.startswith(b"%YAML:") else content, path)
+    text = _KEY.sub(rb"\1 ", content)
+    return Fields.of_bytes(b"#" + text if text.startswith(b"%YAML:") else text, path)

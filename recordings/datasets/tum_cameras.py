@@ -17,7 +17,7 @@ from mapstream.streams.rig import Extrinsics, Rig
 from mapstream.streams.sensors import CameraSensor
 
 FRAME = "camera"
-_SIZE_PX = (640, 480)
+SIZE_PX = (640, 480)
 _INTRINSICS = ("fx", "fy", "cx", "cy")
 _DISTORTION = ("k1", "k2", "p1", "p2", "k3")
 _FREIBURG = {  # fx fy cx cy, k1 k2 p1 p2 k3, by the number of the camera
@@ -50,8 +50,8 @@ def read_rig(folder: Path) -> tuple[Rig, tuple[str, ...]]:
     is_bent = numbers[4:].any()
     calibration = CameraCalibration(
         frame=FRAME,
-        width_px=_SIZE_PX[0],
-        height_px=_SIZE_PX[1],
+        width_px=SIZE_PX[0],
+        height_px=SIZE_PX[1],
         focal_px=numbers[:2],
         center_px=numbers[2:4],
         distortion="radtan" if is_bent else "none",

@@ -4,6 +4,7 @@
     DIR/groundtruth.txt          `stamp x y z qx qy qz qw`, of the colour camera; may be absent
     DIR/truth_cam_poses.txt      the same of key frames, as CubeSLAM has them: line k is of image k, whose listings
                                  then have numbers in the place of stamps
+    DIR/yolov3_bbox.txt          of key frames: `k file`, boxes around a cabinet, see `object_boxes.py`; may be absent
     DIR/*.yaml                   `Camera.fx: ...`, as ORB-SLAM has it; without it the published calibration of the
                                  Freiburg camera (1, 2 or 3) that the name of the folder tells
 
@@ -24,38 +25,54 @@ import numpy as np
 from mapstream.recordings.attached_rig import attach_rig
 from mapstream.recordings.datasets.conversion import Notices, Progress, Topical, write_in_order
 from mapstream.recordings.datasets.image_files import depth_of, image_of
-from mapstream.recordings.datasets.tum_cameras import FRAME, read_rig
+from mapstream.recordings.datasets.object_boxes import read_boxes
+from mapstream.recordings.datasets.tum_cameras import FRAME, SIZE_PX, read_rig
 from mapstream.recordings.mcap_writer import McapWriter
 from mapstream.recordings.odometry_files import read_odometry
 from mapstream.streams.arrays import IntArray
 from mapstream.streams.errors import RecordingError
+from mapstream.streams.messages.objects import ObjectDetections
 
-COLOR, DEPTH, TRUTH = "/color/image", "/depth/image", "/truth"
+COLOR, DEPTH, OBJECTS, TRUTH = "/color/image", "/depth/image", "/color/objects", "/truth"
+_BOXES = "yolov3_bbox.txt"
+_LABEL = "cabinet"  # the one object of these key frames, whose boxes have no class
 _UNITS_PER_M = 5000.0
 _Listed = list[tuple[int, Path]]  # stamps and files
 
 
 def convert_tum_rgbd(source: Path, writer: McapWriter, on_progress: Progress) -> Notices:
-    """Write `/color/image`, `/depth/image` in millimetres and `/truth`, and attach the sensor file."""
+    """Write `/color/image`, `/depth/image` in millimetres `/truth` and `/color/objects`, and attach the sensor file."""
     colors, depths = (_listed(source / name) for name in ("rgb.txt", "depth.txt"))
     rig, notices = read_rig(source)
     attach_rig(writer, rig)
     key_frames = source / "truth_cam_poses.txt"
     truth = key_frames if key_frames.is_file() else source / "groundtruth.txt"
     poses = read_odometry(truth) if truth.is_file() else []
+    boxes: _Listed = []
     if truth == key_frames:
         stamps_ns = np.array([pose.stamp_ns for pose in poses], np.int64)
         colors, depths = (_at(stamps_ns, listed, truth) for listed in (colors, depths))
+        if (source / _BOXES).is_file():
+            boxes = _at(stamps_ns, _listed(source / _BOXES), truth)
     streams: list[Iterator[Topical]] = [
         ((COLOR, image_of(path, stamp_ns, FRAME)) for stamp_ns, path in colors),
         (
             (DEPTH, depth_of(path, stamp_ns, FRAME, units_per_m=_UNITS_PER_M))
             for stamp_ns, path in depths
         ),
+        ((OBJECTS, _objects(path, stamp_ns)) for stamp_ns, path in boxes),
         ((TRUTH, pose) for pose in poses),
     ]
     write_in_order(writer, streams, (colors[0][0], colors[-1][0]), on_progress)
     return notices if poses else (*notices, "there is no ground truth")
+
+
+def _objects(path: Path, stamp_ns: int) -> ObjectDetections:
+    try:
+        content = path.read_text(encoding="utf-8")
+    except OSError as error:
+        raise RecordingError(f"{path}: cannot be read: {error}") from error
+    return read_boxes(content, path, stamp_ns, frame=FRAME, size_px=SIZE_PX, label=_LABEL)
 
 
 def _listed(path: Path) -> _Listed:

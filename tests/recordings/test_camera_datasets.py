@@ -243,6 +243,7 @@ def test_A24_real_tum_key_frames(tmp_path: Path) -> None:
     done = convert(f"tum:{shared('tum_fr3_cabinet_rgbd')}", tmp_path / "out.mcap")
 
     assert decoded(done.path, "/depth/image")[57].stamp_ns == 1341841317250600000
+    assert [len(boxes) for boxes in decoded(done.path, "/color/objects")] == [1] * 58
     assert done.notices == ()
 
 
