@@ -81,7 +81,7 @@ def test_J10_the_covariance_is_that_of_2000_samples(seed: int, num: int) -> None
     samples = alignments(a + noise[:, 0], b + noise[:, 1], w)
 
     sampled = np.cov(se3_log(invert(T_a_b) @ samples).T)
-    found = alignment_covariance(T_a_b, a, b, *covariances, w)
+    found = alignment_covariance(T_a_b, a, b, covariances[0], covariances[1], w)
     np.testing.assert_allclose(np.diag(found), np.diag(sampled), rtol=0.2)
     white = np.linalg.inv(np.linalg.cholesky(sampled))
     ratios = np.linalg.eigvalsh(white @ found @ white.T)  # in every direction, correlations too

@@ -1,0 +1,1 @@
+"""Loops closed by objects that were seen before."""
