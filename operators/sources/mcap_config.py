@@ -13,6 +13,7 @@ from mapstream.recordings.message_codec import known_messages
 from mapstream.streams.calibration import CameraCalibration
 from mapstream.streams.messages.constraints import Constraint, LoopClosure
 from mapstream.streams.messages.estimates import Odometry, PointCloud
+from mapstream.streams.messages.objects import ObjectDetections
 from mapstream.streams.messages.sensors import (
     CameraFrame,
     EncodedImage,
@@ -41,6 +42,7 @@ _TYPES: dict[str, type[Any]] = {  # by the name of a port
     "constraints": Constraint,
     "loops": LoopClosure,
     "biases": ImuBatch,
+    "detections": ObjectDetections,
 }
 
 

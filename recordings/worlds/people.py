@@ -10,11 +10,12 @@ import numpy as np
 from mapstream.recordings.worlds.paint import Painter, Picture
 from mapstream.recordings.worlds.renderer import Pinhole, Renderer, Rendering
 from mapstream.recordings.worlds.surfaces import box_outline, prism
+from mapstream.recordings.worlds.things import Thing
 from mapstream.streams.arrays import FloatArray
 from mapstream.streams.geometry import SE3, invert, so3_exp
 
 PERSON = -2
-"""What the surface of a person is in a rendering: none of the room's."""
+"""What the surface of the first person is in a rendering: none of the room's. Others count down from it."""
 
 _REACH_M = (1.7, 1.4)  # of the way round the table
 _SIZE_M = (0.45, 0.3, 1.7)  # wide, deep, high
@@ -43,6 +44,19 @@ class People:
         spot = [_REACH_M[0] * np.cos(angle), _REACH_M[1] * np.sin(angle), 0.0]
         return SE3.from_rotation(so3_exp([0, 0, angle]), spot)
 
+    def things(self, stamp_ns: int, T_world_camera: FloatArray) -> list[Thing]:
+        """Return the people at a time, in the order of their surfaces."""
+        return [
+            Thing(
+                name=f"person.{number}",
+                label="person",
+                T_world_thing=self.place(number, stamp_ns, T_world_camera),
+                outline_m=box_outline(_SIZE_M[0], _SIZE_M[1]),
+                height_m=_SIZE_M[2],
+            )
+            for number in range(len(self._renderers))
+        ]
+
     def in_front_of(
         self, view: Rendering, lens: Pinhole, stamp_ns: int, T_world_camera: FloatArray
     ) -> Rendering:
@@ -54,7 +68,7 @@ class People:
             view = Rendering(
                 np.where(is_near[..., None], seen.image, view.image),
                 np.where(is_near, seen.inverse_depths, view.inverse_depths),
-                np.where(is_near, PERSON, view.surfaces),
+                np.where(is_near, PERSON - number, view.surfaces),
             )
         return view
 

@@ -93,7 +93,13 @@ class RgbdCamera:
         self, number: int, stamp_ns: int, T_world_camera: FloatArray
     ) -> tuple[EncodedImage, CameraFrame]:
         """Return the colour and the depth image with a number, of a pose (4, 4)."""
-        config, view = self._config, self.ideal_at(stamp_ns, T_world_camera)
+        return self.images(self.ideal_at(stamp_ns, T_world_camera), number, stamp_ns)
+
+    def images(
+        self, view: Rendering, number: int, stamp_ns: int
+    ) -> tuple[EncodedImage, CameraFrame]:
+        """Return the colour and the depth image with a number, of what is seen without noise."""
+        config = self._config
         color = EncodedImage(
             stamp_ns=stamp_ns,
             data=compress(self._film.expose(view.image, number), config.format, config.quality),

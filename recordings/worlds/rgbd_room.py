@@ -10,22 +10,13 @@ import numpy as np
 
 from mapstream.recordings.worlds.paint import Painter, Picture
 from mapstream.recordings.worlds.surfaces import Paint, Surface, box_outline, prism, shell
+from mapstream.recordings.worlds.things import Thing
 from mapstream.streams.arrays import FloatArray
 from mapstream.streams.geometry import SE3, so3_exp
 
 _SIZE_M = (5.2, 4.4, 2.6)
 TABLE_HEIGHT_M = 0.75
 _TABLE_M, _BOARD_M, _LEG_M = (1.4, 0.8), 0.04, 0.06
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Thing:
-    """An object on the table; its frame stands on the table's middle of it, z upwards."""
-
-    name: str  # its class
-    T_world_thing: SE3
-    outline_m: FloatArray  # (N, 2) convex, counter-clockwise from above
-    height_m: float
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -126,7 +117,8 @@ def _things(rng: np.random.Generator) -> tuple[Thing, ...]:
     for (name, outline, height), place in zip(kinds, order, strict=True):
         x, y = np.array(places[place]) + rng.uniform(-0.04, 0.04, 2)
         spot = _at(x, y, TABLE_HEIGHT_M, rng.uniform(0, 2 * np.pi))
-        things.append(Thing(name, spot, outline, height))
+        thing = Thing(name=name, label=name, T_world_thing=spot, outline_m=outline, height_m=height)
+        things.append(thing)
     return tuple(things)
 
 

@@ -21,10 +21,15 @@ from mapstream.recordings.worlds.sensors import (
     drifting_odometry,
     imu_series,
 )
+from mapstream.recordings.worlds.simulated_detector import (
+    SimulatedDetector,
+    SimulatedDetectorConfig,
+)
 from mapstream.recordings.worlds.simulation import Record, Simulation
 from mapstream.recordings.worlds.truth import sensor_id, stamps_at, true_odometry, true_places
+from mapstream.streams.arrays import FloatArray
 from mapstream.streams.geometry import SE3, so3_exp
-from mapstream.streams.messages.sensors import CameraFrame, EncodedImage, TransformBatch
+from mapstream.streams.messages.sensors import TransformBatch
 from mapstream.streams.rig import Extrinsics, Rig
 from mapstream.streams.sensors import CameraSensor, Sensor
 
@@ -57,6 +62,8 @@ class WRgbdConfig(BaseModel):
     """So many walk about beyond the table."""
     without: tuple[str, ...] = ()
     """Things and furniture that are not there: cupboard, crate, or a class of things."""
+    objects: SimulatedDetectorConfig | None = None
+    """A detector of the things on the table and of people, as good as said; none without."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -64,6 +71,7 @@ class RgbdWorld:
     """The room of a recording, and a camera that answers what is seen from any pose."""
 
     room: Room
+    people: People
     camera: RgbdCamera
 
 
@@ -73,14 +81,16 @@ def rgbd_world(config: WRgbdConfig, seed: int) -> RgbdWorld:
     room = room.without(config.without)
     people = People(config.people, seed, START_NS, texel_m=config.texel_m)
     renderer = Renderer(room.surfaces)
-    return RgbdWorld(room, RgbdCamera(config.camera, renderer, T_BASE_CAMERA, seed, people))
+    camera = RgbdCamera(config.camera, renderer, T_BASE_CAMERA, seed, people)
+    return RgbdWorld(room, people, camera)
 
 
 def w_rgbd(config: WRgbdConfig, seed: int) -> Simulation:
     """Return the recording of one way round the room; equal arguments give equal recordings.
 
     Topics: `/color/image`, `/depth/image` (16UC1 [mm], of the same pixels), `/points` if asked for, `/imu`,
-    `/odometry` (drifts); `/truth`, the pose of the base in the room; `/truth/things`, where what is.
+    `/odometry` (drifts); `/truth`, the pose of the base in the room; `/truth/things`, where what is. With a detector
+    `/color/objects` as well, and `/truth/objects`, row by row what was detected, and then what was missed.
     """
     imu_rng, odometry_rng = map(np.random.default_rng, np.random.SeedSequence(seed).spawn(2))
     span_ns = (START_NS, START_NS + round(config.duration_s * 1e9))
@@ -93,7 +103,8 @@ def w_rgbd(config: WRgbdConfig, seed: int) -> Simulation:
     stamps_ns = stamps_at(config.camera.rate_hz, span_ns)
     poses = motion.poses(stamps_ns) @ T_BASE_CAMERA.matrix
     shots = zip(range(len(poses)), stamps_ns.tolist(), poses, strict=True)
-    views = in_order(lambda shot: world.camera.take(*shot), shots)
+    detector = _detector(config, world, seed)
+    taken = in_order(lambda shot: list(_records(*shot, world, detector, config)), shots)
     return Simulation(
         start_ns=span_ns[0],
         end_ns=span_ns[1],
@@ -103,19 +114,41 @@ def w_rgbd(config: WRgbdConfig, seed: int) -> Simulation:
             (Record(m.stamp_ns, "/imu", m) for m in imu.batches()),
             (Record(m.stamp_ns, "/odometry", m) for m in odometry),
             (Record(m.stamp_ns, "/truth", m) for m in true_odometry(motion, imu, span_ns)),
-            chain.from_iterable(_records(*view, world.camera, config) for view in views),
+            chain.from_iterable(taken),
             key=lambda record: record.log_ns,
         ),
     )
 
 
+def _detector(config: WRgbdConfig, world: RgbdWorld, seed: int) -> SimulatedDetector | None:
+    if config.objects is None:
+        return None
+    things = [*world.room.things, *world.people.things(START_NS, np.eye(4))]
+    return SimulatedDetector(
+        config.objects, world.room.surfaces, things, COLOR, T_BASE_CAMERA, seed
+    )
+
+
 def _records(
-    color: EncodedImage, depth: CameraFrame, camera: RgbdCamera, config: WRgbdConfig
+    number: int,
+    stamp_ns: int,
+    T_world_camera: FloatArray,
+    world: RgbdWorld,
+    detector: SimulatedDetector | None,
+    config: WRgbdConfig,
 ) -> Iterator[Record]:
-    yield Record(color.stamp_ns, "/color/image", color)
-    yield Record(depth.stamp_ns, "/depth/image", depth)
+    """Yield what the camera, and whoever looks at its images, says of one moment."""
+    view = world.camera.ideal_at(stamp_ns, T_world_camera)
+    color, depth = world.camera.images(view, number, stamp_ns)
+    yield Record(stamp_ns, "/color/image", color)
+    yield Record(stamp_ns, "/depth/image", depth)
     if config.camera.clouds:
-        yield Record(depth.stamp_ns, "/points", camera.cloud(color, depth))
+        yield Record(stamp_ns, "/points", world.camera.cloud(color, depth))
+    if detector is not None:
+        things = [*world.room.things, *world.people.things(stamp_ns, T_world_camera)]
+        detected = detector.detect(view, things, T_world_camera, number, stamp_ns)
+        yield Record(stamp_ns, "/color/objects", detected.detections)
+        yield Record(stamp_ns, "/truth/objects", detected.truth)
 
 
 def _true_things(room: Room) -> TransformBatch:

@@ -33,7 +33,7 @@ def _recorded(
     """Return a map of what a camera saw at true poses, and which points are of surfaces with these names."""
     world = rgbd_world(world_config, seed=0)
     wanted = {row for row, s in enumerate(world.room.surfaces) if s.name in names}
-    wanted |= {PERSON} if "person" in names else set()
+    wanted |= {PERSON, PERSON - 1} if "person" in names else set()
     stamps_ns = np.linspace(START_NS + 10**9, START_NS + 29 * 10**9, num).astype(np.int64)
     poses = orbit(_DURATION_S, START_NS).poses(stamps_ns) @ T_BASE_CAMERA.matrix
     labels = []
