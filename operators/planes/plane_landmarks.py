@@ -8,6 +8,7 @@ from typing import Any, ClassVar
 import numpy as np
 from pydantic import Field, NonNegativeFloat, PositiveFloat
 
+from mapstream.operators.feedback import Feedback
 from mapstream.operators.operator import (
     DynamicPorts,
     Operator,
@@ -16,21 +17,18 @@ from mapstream.operators.operator import (
     Ports,
     offload,
     report_loss,
-    warn,
 )
 from mapstream.operators.period import Period
 from mapstream.operators.planes.known_planes import KnownPlanes, Reach
 from mapstream.operators.planes.seen_plane import SeenPlane
 from mapstream.operators.planes.whereabouts import Whereabouts
 from mapstream.recordings.maps.hulls import hull_payload
-from mapstream.streams.channel import Receiver, Sender
+from mapstream.streams.channel import Sender
 from mapstream.streams.geometry import SE3
 from mapstream.streams.messages.constraints import Constraint, LandmarkRef
 from mapstream.streams.messages.estimates import MapCorrection, Odometry
 from mapstream.streams.messages.planes import PlaneSegments
 from mapstream.streams.sync import merge
-
-_SECOND_NS = 1_000_000_000
 
 
 class PlaneLandmarksConfig(OperatorConfig):
@@ -97,8 +95,7 @@ class PlaneLandmarks(DynamicPorts, Operator[Ports, Outputs]):
         self._where = Whereabouts(lost_m=config.full_after_m)
         self._periods = [Period(config.period_s) for _ in config.inputs]
         self._waiting: list[PlaneSegments] = []  # for the odometry of their time
-        self._heard: list[MapCorrection] = []  # that do not count yet
-        self._first_ns: int | None = None
+        self._feedback = Feedback(config.feedback_s) if config.feedback_s else None
 
     @classmethod
     def ports_for(cls, config: PlaneLandmarksConfig) -> tuple[dict[str, Any], dict[str, Any]]:
@@ -115,8 +112,12 @@ class PlaneLandmarks(DynamicPorts, Operator[Ports, Outputs]):
                 if self._periods[port].begins(message.stamp_ns):
                     self._waiting.append(message)
                 continue
-            if self._config.feedback_s is not None:
-                await self._hear(inputs["corrections"], message.stamp_ns)
+            if self._feedback is not None:
+                for correction in await self._feedback.counting(
+                    inputs["corrections"], message.stamp_ns
+                ):
+                    self._where.correct(correction)
+                    self.known.move(self._where.at)
             for constraint in await offload(self.follow, message):
                 await outputs.constraints.send(constraint)
             outputs.constraints.advance(message.stamp_ns)
@@ -157,20 +158,3 @@ class PlaneLandmarks(DynamicPorts, Operator[Ports, Outputs]):
             is_switchable=self._config.is_switchable,
             source=f"plane_landmarks {planes.frame}",
         )
-
-    async def _hear(self, corrections: Receiver[MapCorrection], stamp_ns: int) -> None:
-        """Take the corrections over that count at a stamp; wait for those that may still come."""
-        if self._first_ns is None:
-            self._first_ns = stamp_ns
-        counts_ns = stamp_ns - round((self._config.feedback_s or 0.0) * _SECOND_NS)
-        while counts_ns >= self._first_ns and not (
-            self._heard and self._heard[-1].stamp_ns > counts_ns
-        ):
-            correction = await anext(aiter(corrections), None)
-            if correction is None:
-                warn("the optimizer's corrections ended; planes are followed by odometry")
-                return
-            self._heard.append(correction)
-        while self._heard and self._heard[0].stamp_ns <= counts_ns:
-            self._where.correct(self._heard.pop(0))
-            self.known.move(self._where.at)

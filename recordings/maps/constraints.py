@@ -11,6 +11,7 @@ import numpy as np
 from mapstream.recordings.maps.build import append_edges
 from mapstream.recordings.maps.ids import derived_id, id_array
 from mapstream.recordings.maps.model import Map
+from mapstream.recordings.maps.object_facts import with_facts_of
 from mapstream.recordings.maps.plane_hulls import with_hulls_of
 from mapstream.recordings.maps.rows import concatenate
 from mapstream.recordings.maps.tables import Edges, Frames, Landmarks
@@ -25,7 +26,7 @@ def add_constraints(map_: Map, mission_id: str, constraints: Sequence[Constraint
     """Return the map with one edge for each measurement, at the vertex of its stamp.
 
     Outer frames and landmarks that the map does not know are added; a name is one frame, one landmark.
-    Planes grow by the outlines of what was seen of them.
+    Planes grow by the outlines of what was seen of them; objects get the extents and texts that were seen.
 
     Raises:
         MapError: If there is no vertex at a stamp, or a payload is not JSON.
@@ -52,7 +53,8 @@ def add_constraints(map_: Map, mission_id: str, constraints: Sequence[Constraint
     )
     first = len(map_.edges)
     map_ = append_edges(map_, added)
-    return with_hulls_of(map_, np.arange(first, len(map_.edges)))
+    new = np.arange(first, len(map_.edges))
+    return with_facts_of(with_hulls_of(map_, new), new)
 
 
 def landmark_id(landmark: LandmarkRef) -> bytes:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 
 import numpy as np
 import numpy.typing as npt
@@ -29,9 +30,9 @@ def convex_hull(points: npt.NDArray[np.floating]) -> FloatArray:
     return hull
 
 
-def hull_payload(hull_m: FloatArray) -> bytes:
-    """Return the JSON of a hull (K, 2), to a millimetre."""
-    return json.dumps({"hull": np.round(hull_m, _MILLIMETRES).tolist()}).encode()
+def hull_payload(hull_m: FloatArray, more: Mapping[str, object] | None = None) -> bytes:
+    """Return the JSON of a hull (K, 2), to a millimetre, and of what else is said of the plane."""
+    return json.dumps({**(more or {}), "hull": np.round(hull_m, _MILLIMETRES).tolist()}).encode()
 
 
 def hull_of(payload: bytes) -> FloatArray:

@@ -11,6 +11,7 @@ import numpy as np
 
 from mapstream.recordings.maps.hulls import convex_hull, hull_of, hull_payload, moved_hull
 from mapstream.recordings.maps.model import Map
+from mapstream.recordings.maps.object_payload import object_payload
 from mapstream.streams.arrays import FloatArray, IntArray
 from mapstream.streams.geometry import invert
 
@@ -32,6 +33,6 @@ def with_hulls_of(map_: Map, edges: IntArray) -> Map:
             seen.setdefault(landmark, []).append(moved_hull(T, hull))
     payload = map_.landmarks.payload.copy()
     for landmark, hulls in seen.items():
-        known = hull_of(payload[landmark])
-        payload[landmark] = hull_payload(convex_hull(np.concatenate([known, *hulls])))
+        grown = convex_hull(np.concatenate([hull_of(payload[landmark]), *hulls]))
+        payload[landmark] = hull_payload(grown, object_payload(map_.landmarks, landmark))
     return replace(map_, landmarks=replace(map_.landmarks, payload=payload))

@@ -43,7 +43,12 @@ def seen(map_: Map, rows: IntArray, noise_of: NoiseModels) -> dict[int, Factor]:
     factors = planes.seen(map_, rows[shapes == "plane"], noise_of)
     for row, shape in zip(rows.tolist(), shapes.tolist(), strict=True):
         pose, landmark = int(edges.vertex_a[row]), key_of("landmark", int(edges.landmark_a[row]))
-        if shape == "pose":
+        if shape == "pose" and np.isinf(np.diagonal(edges.covariance[row])[:3]).all():
+            noise = noise_of(edges.covariance[row, 3:, 3:])
+            factors[row] = OwnFactor(
+                noise, [pose, landmark], _euclidean(edges.T_a_b[row], is_pose=True)
+            )
+        elif shape == "pose":
             measured, noise = gtsam.Pose3(edges.T_a_b[row]), noise_of(edges.covariance[row])
             factors[row] = gtsam.BetweenFactorPose3(pose, landmark, measured, noise)
         elif shape == "point2d":
@@ -74,7 +79,8 @@ def _point(map_: Map, row: int, noise_of: NoiseModels) -> Factor:
     return gtsam.BearingRangeFactor3D(pose, landmark, bearing, range_m, noise)
 
 
-def _euclidean(T_base_point: FloatArray) -> Any:  # noqa: ANN401
+def _euclidean(T_base_point: FloatArray, *, is_pose: bool = False) -> Any:  # noqa: ANN401
+    """Return the residual of a point, or of a landmark with an orientation of which only the place was seen."""
     R, t = T_base_point[:3, :3], T_base_point[:3, 3]
 
     def residual(
@@ -83,9 +89,13 @@ def _euclidean(T_base_point: FloatArray) -> Any:  # noqa: ANN401
         jacobians: list[FloatArray] | None,
     ) -> FloatArray:
         by_pose, by_point = np.zeros((3, 6), order="F"), np.zeros((3, 3), order="F")
-        predicted = values.atPose3(keys[0]).transformTo(values.atPoint3(keys[1]), by_pose, by_point)
+        landmark = values.atPose3(keys[1]) if is_pose else None
+        point = landmark.translation() if landmark else values.atPoint3(keys[1])
+        predicted = values.atPose3(keys[0]).transformTo(point, by_pose, by_point)
         if jacobians is not None:
             jacobians[0] = np.asfortranarray(R.T @ by_pose)
+            if landmark:  # it moves along its own axes
+                by_point = np.hstack([np.zeros((3, 3)), by_point @ landmark.rotation().matrix()])
             jacobians[1] = np.asfortranarray(R.T @ by_point)
         error: FloatArray = R.T @ (predicted - t)
         return error

@@ -112,6 +112,21 @@ def wall_line(map_: Map, truth: np.ndarray) -> Map:
     return with_constraints(map_, [made])
 
 
+def place_of_a_pose(map_: Map, truth: np.ndarray) -> Map:
+    """A sign of which only the place was seen."""
+    covariance = COVARIANCE.copy()
+    covariance[:3] = covariance[:, :3] = 0.0
+    covariance[:3, :3] = np.diag([np.inf] * 3)
+    made = Constraint(
+        stamp_ns=1,
+        kind="landmark",
+        T_a_b=SE3.exp([0.3, 0.9, 0.2, 3.0, 1.0, 0.5]),
+        covariance=covariance,
+        landmark=LandmarkRef(name="sign", kind="pose"),
+    )
+    return with_constraints(map_, [made])
+
+
 def at_the_base(map_: Map, truth: np.ndarray) -> Map:
     """A point without a bearing."""
     ref = LandmarkRef(name="p")
@@ -150,6 +165,7 @@ BUILDERS = {
     "landmarks": seen("point", "point2d", "pose", "visual"),
     "plane": seen("plane"),
     "wall_line": wall_line,
+    "place_of_a_pose": place_of_a_pose,
     "at_the_base": at_the_base,
     "relations": relations,
     "imu": imu,

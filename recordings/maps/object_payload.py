@@ -1,0 +1,22 @@
+"""What a landmark of kind object says beyond its columns: extent, text, and the name that people gave it."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+from mapstream.recordings.maps.tables import Landmarks
+
+
+def object_payload(landmarks: Landmarks, row: int) -> dict[str, Any]:
+    """Return `extent_m`, `text`, `name` and whatever else a landmark says, as far as it does."""
+    try:
+        known = json.loads(landmarks.payload[row] or b"{}")
+    except ValueError:  # of another program
+        return {}
+    return known if isinstance(known, dict) else {}
+
+
+def payload_bytes(known: dict[str, Any]) -> bytes:
+    """Return these as the bytes of a payload; empty, if there are none."""
+    return json.dumps(known, sort_keys=True).encode() if known else b""
