@@ -14,3 +14,11 @@ def shared(name: str) -> Path:
     if not path.exists():
         pytest.skip(f"no {name} among the shared data (set MAPSTREAM_DATA)")
     return path
+
+
+def model(name: str) -> Path:
+    """Return a network that lies beside the shared data; the test is skipped where it is absent."""
+    path = _DATA.parent / "models" / name
+    if not path.exists():
+        pytest.skip(f"no network {name} in the folder models beside the shared data")
+    return path

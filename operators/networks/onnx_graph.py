@@ -38,7 +38,12 @@ class Graph:
         self._weights: list[bytes] = []
         self._inputs: list[bytes] = []
         self._outputs: list[bytes] = []
+        self._metadata: dict[str, str] = {}
         self._count = 0
+
+    def describe(self, key: str, text: str) -> None:
+        """Add a line of what the file says of itself."""
+        self._metadata[key] = text
 
     def input(self, name: str, dtype: npt.DTypeLike, shape: Shape) -> Value:
         """Declare an input."""
@@ -82,6 +87,10 @@ class Graph:
                 _field(2, _PRODUCER),
                 _field(7, graph),
                 _field(8, _number(2, _OPERATOR_SET)),
+                *(
+                    _field(14, _field(1, key.encode()) + _field(2, text.encode()))
+                    for key, text in self._metadata.items()
+                ),
             ]
         )
 

@@ -13,6 +13,7 @@ from mapstream.streams.errors import ConfigError, OperatorError
 
 _ELEMENTS = {
     "tensor(float)": np.float32,
+    "tensor(float16)": np.float16,
     "tensor(uint8)": np.uint8,
     "tensor(int32)": np.int32,
     "tensor(int64)": np.int64,
@@ -57,6 +58,7 @@ class Session:
         self._dtypes = {
             i.name: np.dtype(_ELEMENTS.get(i.type, np.float32)) for i in self._session.get_inputs()
         }
+        self.metadata: dict[str, str] = dict(self._session.get_modelmeta().custom_metadata_map)
         self.outputs: Shapes = {o.name: tuple(o.shape) for o in self._session.get_outputs()}
 
     def run(self, feeds: Mapping[str, npt.NDArray[Any]]) -> dict[str, npt.NDArray[Any]]:

@@ -10,7 +10,7 @@ from pydantic import Field, NonNegativeFloat
 from mapstream.operators.operator import DynamicPorts, Operator, OperatorConfig, Ports, warn
 from mapstream.streams.channel import Sender
 from mapstream.streams.messages.vision import ImageFeatures, NFrame
-from mapstream.streams.sync import merge
+from mapstream.streams.moments import moments
 
 
 class NFramesConfig(OperatorConfig):
@@ -45,18 +45,8 @@ class NFrames(DynamicPorts, Operator[Ports, Outputs]):
 
     async def run(self, inputs: Ports, outputs: Outputs) -> None:
         names = self._config.inputs
-        gathered: dict[int, ImageFeatures] = {}  # by number of the input
-        async for port, features in merge(*(inputs[name] for name in names)):
-            first = next(iter(gathered.values()), features)
-            is_apart = features.stamp_ns - first.stamp_ns > self._tolerance_ns
-            if gathered and (is_apart or port in gathered):
-                await outputs.n_frames.send(self._joined(gathered))
-                gathered = {}
-            gathered[port] = features
-            if len(gathered) == len(names):
-                await outputs.n_frames.send(self._joined(gathered))
-                gathered = {}
-        if gathered:
+        receivers = [inputs[name] for name in names]
+        async for gathered in moments(receivers, self._tolerance_ns):
             await outputs.n_frames.send(self._joined(gathered))
 
     def _joined(self, gathered: dict[int, ImageFeatures]) -> NFrame:

@@ -1,0 +1,1 @@
+"""Networks that find objects in images, each kind of file behind one call."""
