@@ -32,9 +32,9 @@ class Views:
     points: FloatArray  # (N, 3) in the map frame [m]; NaN where only a ray is known
     point_sigmas_m: FloatArray  # (N,)
 
-    def taken(self, mask: BoolArray) -> Views:
-        """Return some of these."""
-        return Views(*(getattr(self, name)[mask] for name in self.__dataclass_fields__))
+    def taken(self, which: BoolArray | IntArray) -> Views:
+        """Return some of these, by a mask or by their numbers."""
+        return Views(*(getattr(self, name)[which] for name in self.__dataclass_fields__))
 
 
 def views_of(map_: Map, rows: IntArray) -> Views:

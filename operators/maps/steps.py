@@ -42,6 +42,7 @@ TOOLS = {
     "find_places": "mapstream.operators.lidar.places.find_places:find_places",
     "fix_stationary": "mapstream.operators.maps.stationary:fix_stationary",
     "keyframe": "mapstream.operators.maps.keyframing:keyframe",
+    "object_landmarks": "mapstream.operators.objects.landmarks.object_landmarks:object_landmarks",
     "optimize": "mapstream.operators.estimation.batch:optimize_map",
     "register": "mapstream.operators.lidar.constraints.register:register",
     "remove_bad_landmarks": "mapstream.operators.landmarks.removal:remove_bad_landmarks",

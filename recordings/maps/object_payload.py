@@ -10,8 +10,13 @@ from mapstream.recordings.maps.tables import Landmarks
 
 def object_payload(landmarks: Landmarks, row: int) -> dict[str, Any]:
     """Return `extent_m`, `text`, `name` and whatever else a landmark says, as far as it does."""
+    return payload_of(landmarks.payload[row])
+
+
+def payload_of(payload: bytes) -> dict[str, Any]:
+    """Return what a payload says, as `object_payload`."""
     try:
-        known = json.loads(landmarks.payload[row] or b"{}")
+        known = json.loads(payload or b"{}")
     except ValueError:  # of another program
         return {}
     return known if isinstance(known, dict) else {}

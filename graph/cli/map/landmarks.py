@@ -31,6 +31,7 @@ class Verb:
 
 VERBS = (
     Verb("create-landmarks", "itl", "Make landmarks of tracks that have none yet."),
+    Verb("object-landmarks", "", "Make one landmark of each object that detectors found, with its class and extent."),
     Verb("retriangulate", "rtl", "Put landmarks where their observations see them from the poses of now."),
     Verb("evaluate-quality", "elq", "Judge which landmarks are good and which are bad."),
     Verb("reset-quality", "rlq", "Forget which landmarks are good."),
