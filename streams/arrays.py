@@ -50,3 +50,9 @@ def frozen_optional(
     """Like `frozen`, for a field that may be None."""
     if getattr(owner, field) is not None:
         frozen(owner, field, dtype, shape)
+
+
+def finite_rows(rows: npt.NDArray[np.floating]) -> BoolArray:
+    """Tell which rows (N, ...) are finite."""
+    finite: BoolArray = np.isfinite(rows).all(axis=tuple(range(1, rows.ndim)))
+    return finite

@@ -57,6 +57,8 @@ class ObjectDetectorConfig(OperatorConfig):
     """The same for some classes, by name."""
     max_overlap: float = Field(default=0.45, ge=0.0, le=1.0)
     """Of two boxes of a class that overlap more the better stays: what both cover as a share of what either does."""
+    max_class_overlap: float = Field(default=0.85, ge=0.0, le=1.0)
+    """The same for boxes of different classes, such as a car that is also taken for a truck."""
     classes: tuple[str, ...] = ()
     """Classes that are wanted, if not all."""
     max_detections: PositiveInt = 300
@@ -173,10 +175,16 @@ class ObjectFinder:
             axis=1
         )
         wanted = np.flatnonzero(is_wanted)
-        rows = wanted[
-            distinct(boxes[wanted], found.scores[wanted], classes[wanted], self._config.max_overlap)
-        ]
-        most = self._config.max_detections
+        config = self._config
+        distinct_rows = distinct(
+            boxes[wanted],
+            found.scores[wanted],
+            classes[wanted],
+            max_overlap=config.max_overlap,
+            max_class_overlap=config.max_class_overlap,
+        )
+        rows = wanted[distinct_rows]
+        most = config.max_detections
         for _ in rows[most:]:
             warn(f"objects of {frame.frame} beyond the best {most} of an image (max_detections)")
         return rows[:most]

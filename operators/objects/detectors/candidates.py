@@ -34,12 +34,6 @@ class Candidates:
     num_broken: int = 0  # with numbers that are not finite, left out
 
 
-def is_whole(rows: npt.NDArray[np.floating]) -> BoolArray:
-    """Tell which rows (N, ...) are finite."""
-    finite: BoolArray = np.isfinite(rows.reshape(len(rows), -1)).all(axis=1)
-    return finite
-
-
 def sampled(
     grid: Float32Array,
     scale: npt.NDArray[np.float64],

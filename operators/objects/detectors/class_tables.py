@@ -32,7 +32,7 @@ def class_table(
         ConfigError: If there is no table, or one of another length.
     """
     if file is not None:
-        table, place = _of_file(file), str(file)
+        table, place = read_names(file), str(file)
     elif "names" in metadata:
         table, place = _of_metadata(name, metadata["names"]), f"the `names` in {name}"
     elif num_classes is None:
@@ -50,7 +50,12 @@ def class_table(
     return table
 
 
-def _of_file(file: Path) -> tuple[str, ...]:
+def read_names(file: Path) -> tuple[str, ...]:
+    """Return the names of classes in a text file, one a line.
+
+    Raises:
+        ConfigError: If it cannot be read.
+    """
     try:
         lines = file.read_text(encoding="utf-8").splitlines()
     except (OSError, UnicodeDecodeError) as error:

@@ -10,9 +10,10 @@ from functools import partial
 
 import numpy as np
 
-from mapstream.operators.objects.detectors.candidates import Candidates, is_whole
+from mapstream.operators.objects.detectors.candidates import Candidates
 from mapstream.operators.objects.detectors.image_fit import ImageFit
 from mapstream.operators.objects.detectors.layout import Layout, Outputs, Probe
+from mapstream.streams.arrays import finite_rows
 
 EXPECTED = "one output (B, 5 + classes, H / 16, W / 16)"
 _STRIDE_PX = 16
@@ -37,7 +38,7 @@ def _read(
     grid = outputs[name]
     num_rows, num_columns = grid.shape[1:]
     rows = grid.reshape(len(grid), -1).T
-    whole = is_whole(rows)
+    whole = finite_rows(rows)
     sure = np.clip(np.where(whole[:, None], rows, 0.0), 0.0, None)  # scores are not negative
     scores = sure[:, 0] ** _SURE_OF_BOX * sure[:, 5:].max(axis=1) ** _SURE_OF_CLASS
     chosen = np.flatnonzero(whole & (scores >= least_score))

@@ -15,10 +15,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from mapstream.operators.objects.detectors.candidates import Candidates, is_whole, sampled
+from mapstream.operators.objects.detectors.candidates import Candidates, sampled
 from mapstream.operators.objects.detectors.image_fit import ImageFit
 from mapstream.operators.objects.detectors.layout import Layout, Outputs, Probe
-from mapstream.streams.arrays import BoolArray, Float32Array
+from mapstream.streams.arrays import BoolArray, Float32Array, finite_rows
 from mapstream.streams.errors import OperatorError
 
 EXPECTED = "outputs boxes (N, 4), labels (N,), scores (N,) and, for masks, masks (N, 1, h, w)"
@@ -68,7 +68,7 @@ def _read(outputs: Outputs, fit: ImageFit, least_score: float, *, names: _Names)
     counts = {len(part) for part in (boxes, scores, labels, masks) if part is not None}
     if len(counts) > 1:
         raise OperatorError(f"mask_rcnn: outputs of one image with {sorted(counts)} objects")
-    whole = is_whole(boxes) & np.isfinite(scores)
+    whole = finite_rows(boxes) & np.isfinite(scores)
     chosen = np.flatnonzero(whole & (scores >= least_score))
     source = None
     if masks is not None:

@@ -1,4 +1,4 @@
-"""One box for each object: of boxes of a class that overlap, the best."""
+"""One box for each object: of boxes that overlap, the best."""
 
 from __future__ import annotations
 
@@ -8,15 +8,21 @@ from mapstream.streams.arrays import Float32Array, FloatArray, IntArray
 
 
 def distinct(
-    boxes_px: Float32Array, scores: Float32Array, classes: IntArray, max_overlap: float
+    boxes_px: Float32Array,
+    scores: Float32Array,
+    classes: IntArray,
+    *,
+    max_overlap: float,
+    max_class_overlap: float,
 ) -> IntArray:
-    """Return rows of boxes that overlap no better one of their class, the best first.
+    """Return rows of boxes that overlap no better one, the best first.
 
     Args:
         boxes_px: Shape (N, 4).
         scores: Shape (N,).
         classes: Shape (N,).
-        max_overlap: The most that two may overlap: what is in both as a share of what is in either.
+        max_overlap: The most that two of a class may overlap: what both cover as a share of what either does.
+        max_class_overlap: The same for two of different classes: one thing may be taken for two.
     """
     left = np.argsort(-scores, kind="stable")
     areas = np.prod(boxes_px[:, 2:] - boxes_px[:, :2], axis=1, dtype=np.float64)
@@ -26,7 +32,8 @@ def distinct(
         kept.append(best)
         shared = _shared_area(boxes_px[best], boxes_px[left])
         either = areas[best] + areas[left] - shared
-        left = left[(classes[left] != classes[best]) | (shared <= max_overlap * either)]
+        most = np.where(classes[left] == classes[best], max_overlap, max_class_overlap)
+        left = left[shared <= most * either]
     return np.array(kept, np.int64)
 
 

@@ -12,10 +12,10 @@ from functools import partial
 
 import numpy as np
 
-from mapstream.operators.objects.detectors.candidates import Candidates, is_whole, sampled
+from mapstream.operators.objects.detectors.candidates import Candidates, sampled
 from mapstream.operators.objects.detectors.image_fit import ImageFit
 from mapstream.operators.objects.detectors.layout import Layout, Outputs, Probe
-from mapstream.streams.arrays import BoolArray, Float32Array, FloatArray
+from mapstream.streams.arrays import BoolArray, Float32Array, FloatArray, finite_rows
 
 EXPECTED = "outputs (B, 4 + classes + M, N) and, for masks, (B, M, h, w); exported without nms"
 
@@ -47,7 +47,7 @@ def layout(probe: Probe) -> Layout | None:
 
 def _read(outputs: Outputs, fit: ImageFit, least_score: float, *, ends: _Ends) -> Candidates:
     table = outputs[ends.boxes]
-    whole = is_whole(table.T)
+    whole = finite_rows(table.T)
     sure = table[4 : 4 + ends.num_classes]
     chosen = np.flatnonzero(whole & (sure.max(axis=0) >= least_score))
     rows = table[:, chosen].T

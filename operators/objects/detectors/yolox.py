@@ -10,10 +10,10 @@ from functools import partial
 
 import numpy as np
 
-from mapstream.operators.objects.detectors.candidates import Candidates, is_whole
+from mapstream.operators.objects.detectors.candidates import Candidates
 from mapstream.operators.objects.detectors.image_fit import ImageFit
 from mapstream.operators.objects.detectors.layout import Layout, Outputs, Probe
-from mapstream.streams.arrays import Float32Array
+from mapstream.streams.arrays import Float32Array, finite_rows
 
 EXPECTED = "one output (B, N, 5 + classes), N cells of 8, 16, 32 (and 64) px"
 _STRIDES_PX = ((8, 16, 32), (8, 16, 32, 64))
@@ -47,7 +47,7 @@ def _read(
     outputs: Outputs, fit: ImageFit, least_score: float, *, name: str, cells: Float32Array
 ) -> Candidates:
     rows = outputs[name]
-    whole = is_whole(rows)
+    whole = finite_rows(rows)
     chosen = np.flatnonzero(whole & (rows[:, 4] >= least_score))  # no class is surer than its box
     rows, cells = rows[chosen], cells[chosen]
     classes = rows[:, 5:].argmax(axis=1)

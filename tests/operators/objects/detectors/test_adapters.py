@@ -146,6 +146,19 @@ def test_J1_mask_rcnn_may_have_masks_of_its_boxes(tmp_path: Path) -> None:
     np.testing.assert_array_equal(found.masks[0], np.tile(np.arange(30)[:, None] >= 15, (1, 30)))
 
 
+def test_mask_rcnn_may_find_nothing(tmp_path: Path) -> None:
+    outputs: dict[str, npt.NDArray[Any]] = {
+        "boxes": np.zeros((0, 4), np.float32),
+        "labels": np.zeros(0, np.int64),
+        "scores": np.zeros(0, np.float32),
+        "masks": np.zeros((0, 1, 30, 40), np.float32),
+    }
+
+    found = find(detector_file(tmp_path, outputs, [3, 30, 40]), (40, 30))
+
+    assert (len(found), found.masks) == (0, ())
+
+
 def test_a_label_that_has_no_name_is_told(tmp_path: Path) -> None:
     masks = np.ones((2, 1, 4, 4), np.float32)
     file = rcnn_file(tmp_path, masks, ("boxes", "labels", "scores", "masks"), label=120)

@@ -66,26 +66,28 @@ _BOXES = st.lists(
 )
 
 
-@given(boxes=_BOXES, max_overlap=st.floats(0.0, 1.0), seed=st.integers(0, 99))
+@given(boxes=_BOXES, limits=st.tuples(*[st.floats(0.0, 1.0)] * 2), seed=st.integers(0, 99))
 def test_what_is_left_overlaps_little_and_what_went_overlapped_a_better_one(
-    boxes: list[tuple[int, ...]], max_overlap: float, seed: int
+    boxes: list[tuple[int, ...]], limits: tuple[float, float], seed: int
 ) -> None:
     table = np.array(boxes, np.float32).reshape(-1, 5)
     corners = np.hstack([table[:, :2], table[:, :2] + table[:, 2:4]])
     classes = table[:, 4].astype(np.int64)
     scores = np.random.default_rng(seed).permutation(len(table)).astype(np.float32)
 
-    kept = distinct(corners, scores, classes, max_overlap).tolist()
+    kept = distinct(
+        corners, scores, classes, max_overlap=limits[0], max_class_overlap=limits[1]
+    ).tolist()
 
-    def overlap(a: int, b: int) -> float:
+    def excess(a: int, b: int) -> float:
         low = np.maximum(corners[a, :2], corners[b, :2])
         high = np.minimum(corners[a, 2:], corners[b, 2:])
         shared = float(np.prod(np.maximum(high - low, 0)))
         areas = [float(np.prod(corners[i, 2:] - corners[i, :2])) for i in (a, b)]
-        return shared / (sum(areas) - shared) if classes[a] == classes[b] else 0.0
+        return shared / (sum(areas) - shared) - limits[int(classes[a] != classes[b])]
 
     assert scores[kept].tolist() == sorted(scores[kept], reverse=True)
     for row in range(len(table)):
-        above = [other for other in kept if scores[other] > scores[row]]
-        most = max((overlap(row, other) for other in above), default=0.0)
-        assert (row in kept) == (most <= max_overlap) or most == pytest.approx(max_overlap)
+        above = [excess(row, other) for other in kept if scores[other] > scores[row]]
+        most = max(above, default=-1.0)
+        assert (row in kept) == (most <= 0) or most == pytest.approx(0, abs=1e-12)

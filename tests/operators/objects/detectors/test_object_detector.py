@@ -118,13 +118,16 @@ async def test_objects_on_top_of_each_other_are_one_of_a_class(tmp_path: Path) -
     rows[10] = [0.5, 0.5, 0, 0, 0.9, 1, 0, 0]
     rows[11] = [-0.4, 0.5, 0, 0, 0.8, 1, 0, 0]  # nearly the same box
     rows[9] = [1.4, 0.5, 0, 0, 0.7, 0, 1, 0]
+    rows[8] = [2.5, 0.5, 0, 0, 0.6, 0, 0, 1]  # the first box, taken for another thing
     file = yolox_file(tmp_path, rows, names=_NAMES)
 
     (once,) = await detected(file, [seen(1)])
     (twice,) = await detected(file, [seen(1)], max_overlap=0.9)
+    (all_,) = await detected(file, [seen(1)], max_overlap=1.0, max_class_overlap=1.0)
 
     assert once.labels == ("person", "cup")
     assert twice.labels == ("person", "person", "cup")
+    assert all_.labels == ("person", "person", "cup", "chair")
 
 
 async def test_five_hundred_objects_in_an_image_are_survived(tmp_path: Path) -> None:
