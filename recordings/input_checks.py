@@ -8,11 +8,13 @@ from typing import Any
 
 import numpy as np
 
+from mapstream.recordings.detection_checks import object_faults
 from mapstream.recordings.feature_checks import feature_faults, width_fault
 from mapstream.recordings.stamp_checks import Finding
 from mapstream.streams.arrays import FloatArray
 from mapstream.streams.messages.constraints import Constraint, LoopClosure
 from mapstream.streams.messages.estimates import Odometry
+from mapstream.streams.messages.objects import ObjectDetections
 from mapstream.streams.messages.vision import ImageFeatures
 
 _SYMMETRY = 1e-6  # of a covariance: what rounding to single precision leaves
@@ -41,6 +43,8 @@ class InputChecks:
             found = loop_faults(message)
         elif isinstance(message, ImageFeatures):
             found = self._feature_faults(message)
+        elif isinstance(message, ObjectDetections):
+            found = list(object_faults(message))
         for reason in found:
             self._reasons[reason] += 1
             self._first.setdefault(reason, message.stamp_ns)

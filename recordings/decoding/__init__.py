@@ -11,7 +11,7 @@ from functools import partial
 from typing import Any
 
 from mapstream.recordings import message_codec
-from mapstream.recordings.decoding import foxglove, ros, ros_clouds, ros_images
+from mapstream.recordings.decoding import foxglove, ros, ros_clouds, ros_images, ros_objects
 from mapstream.recordings.decoding.cursor import CdrCursor, Ros1Cursor
 from mapstream.recordings.decoding.decoder import Decoder, Parse
 from mapstream.recordings.message_schema import PACKAGE
@@ -19,6 +19,7 @@ from mapstream.recordings.recording import Channel
 from mapstream.streams.calibration import CameraCalibration
 from mapstream.streams.errors import DecodeError
 from mapstream.streams.messages.estimates import Odometry
+from mapstream.streams.messages.objects import ObjectDetections
 from mapstream.streams.messages.sensors import (
     CameraFrame,
     EncodedImage,
@@ -54,6 +55,8 @@ _ROS: list[tuple[str, type[Any], _Read]] = [
     ("geometry_msgs/PoseWithCovarianceStamped", Odometry, ros.pose_with_covariance),
     ("tf2_msgs/TFMessage", TransformBatch, ros.transforms),
     ("tf/tfMessage", TransformBatch, ros.transforms),
+    ("vision_msgs/Detection2DArray", ObjectDetections, ros_objects.detections_2d),
+    ("vision_msgs/Detection3DArray", ObjectDetections, ros_objects.detections_3d),
 ]
 _FOXGLOVE: list[tuple[str, type[Any], _Read]] = [
     ("foxglove.PointCloud", LidarScan, foxglove.point_cloud),

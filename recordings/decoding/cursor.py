@@ -21,6 +21,7 @@ _U8: Final = Struct("<B")
 _I8: Final = Struct("<b")
 _U16: Final = Struct("<H")
 _U32: Final = Struct("<I")
+_I64: Final = Struct("<q")
 _F32: Final = Struct("<f")
 _F64: Final = Struct("<d")
 _STAMP: Final = Struct("<II")
@@ -66,6 +67,9 @@ class CdrCursor:
         start = self._align(4)
         self.position = start + 4
         return int(_U32.unpack_from(self.data, start)[0])
+
+    def i64(self) -> int:
+        return int(self._number(_I64))
 
     def f32(self) -> float:
         return float(self._number(_F32))
