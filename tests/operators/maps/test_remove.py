@@ -16,6 +16,7 @@ from mapstream.operators.maps.residuals import chi2, relative_edges
 from mapstream.operators.maps.split import split_mission
 from mapstream.recordings.maps import Map, check_map
 from mapstream.recordings.maps.build import append_edges
+from mapstream.recordings.maps.semantic_tables import Detections
 from mapstream.recordings.maps.tables import Edges, Observations
 from mapstream.streams.errors import MapError
 from mapstream.streams.geometry import SE3, se3_exp, se3_log
@@ -106,7 +107,7 @@ def test_M17_landmarks_that_others_see_stay_where_they_are() -> None:
         sensor=np.array(["camera"] * 2, dtype=object),
         keypoint_px=np.ones((2, 2), dtype=np.float32),
     )
-    map_ = replace(map_, observations=seen)
+    map_ = replace(map_, observations=seen, detections=Detections())
     quat = map_.landmarks.quat_base_xyzw.copy()
     quat[0] = SE3.exp([0.3, 0.2, 0.1, 0, 0, 0]).quat_xyzw
     map_ = replace(map_, landmarks=replace(map_.landmarks, quat_base_xyzw=quat))
