@@ -9,7 +9,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from mapstream.recordings.maps.columns import BytesArray
 from mapstream.recordings.maps.model import Map
+from mapstream.recordings.maps.object_payload import object_payload, payload_bytes, payload_of
 from mapstream.streams.arrays import IntArray
 from mapstream.streams.errors import MapError
 
@@ -26,6 +28,7 @@ def merge_landmarks(map_: Map, pairs: IntArray) -> tuple[Map, MergeReport]:
     """Return the map in which landmarks of each pair are one; pairs of pairs are one as well.
 
     The first in the table stays where it is, and has the observations, tracks, descriptors and edges of all.
+    It keeps the name that people gave it; if it has none, it gets that of another.
     An edge between two that are now one goes.
 
     Args:
@@ -55,6 +58,7 @@ def merge_landmarks(map_: Map, pairs: IntArray) -> tuple[Map, MergeReport]:
     is_loop = (a >= 0) & (a == b)
     merged = replace(
         map_,
+        landmarks=replace(map_.landmarks, payload=_named(map_, kept)),
         observations=replace(map_.observations, landmark=moved[map_.observations.landmark]),
         edges=replace(edges, landmark_a=a, landmark_b=np.where(is_loop, -1, b)),
     ).select(landmarks=~goes, edges=~is_loop)
@@ -63,6 +67,17 @@ def merge_landmarks(map_: Map, pairs: IntArray) -> tuple[Map, MergeReport]:
         num_merged=int(goes.sum()),
         num_between_missions=int((goes & (mission != mission[kept])).sum()),
     )
+
+
+def _named(map_: Map, kept: IntArray) -> BytesArray:
+    """Return the payloads (L,) where the landmark that stands for each (L,) has the name of one that has a name."""
+    payload = map_.landmarks.payload.copy()
+    for row in np.flatnonzero(kept != np.arange(len(kept))).tolist():
+        name = object_payload(map_.landmarks, row).get("name")
+        known = payload_of(payload[kept[row]])
+        if name and "name" not in known:
+            payload[kept[row]] = payload_bytes(known | {"name": name})
+    return payload
 
 
 def _first_of_its_group(pairs: IntArray, num: int) -> IntArray:

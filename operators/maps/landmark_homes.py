@@ -1,4 +1,4 @@
-"""Landmarks whose vertex goes: those that others still see move to one of these."""
+"""Landmarks whose vertex goes: those that others still see move to one of these; regions to the nearest."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from mapstream.operators.maps.region_homes import regions_rehomed
 from mapstream.recordings.maps.model import Map
 from mapstream.recordings.maps.tables import Landmarks
 from mapstream.streams.arrays import BoolArray, IntArray
@@ -26,7 +27,8 @@ def without_vertices(map_: Map, keep: BoolArray) -> Map:
 
 
 def rehomed(map_: Map, keep: BoolArray) -> Map:
-    """Return the map with landmarks fixed to vertices where the mask is true, wherever one sees them."""
+    """Return the map with landmarks fixed to vertices where the mask is true, wherever one sees them; regions, too."""
+    map_ = regions_rehomed(map_, keep)
     landmarks, vertices = map_.landmarks, map_.vertices
     lost = np.flatnonzero(~keep[landmarks.vertex])
     home = _first_observers(map_, keep)[lost]

@@ -20,12 +20,15 @@ from mapstream.recordings.maps.ids import as_keys
 from mapstream.recordings.maps.model import TABLES, Map, from_tables
 from mapstream.recordings.maps.order import in_canonical_order
 from mapstream.recordings.maps.rows import concatenate, shifted, table_digest
+from mapstream.recordings.maps.semantic_tables import Regions
 from mapstream.recordings.maps.tables import Frames, Journal, Projections
 from mapstream.streams.arrays import BoolArray, IntArray
 from mapstream.streams.errors import MapError
 from mapstream.streams.geometry import invert
 
-_WITH_IDS = ("missions", "frames", "vertices", "landmarks", "edges", "resources", "projections")
+_WITH_IDS = (
+    "missions", "frames", "vertices", "landmarks", "edges", "regions", "resources", "projections"
+)  # fmt: skip
 _PARTS = (
     ("imu", "edge"),
     ("feature_sets", "vertex"),
@@ -56,6 +59,7 @@ def merge(maps: Sequence[Map], config: MergeConfig | None = None) -> tuple[Map, 
     A mission that is in several maps with the same content is there once, and places the others of its map.
     Parts of a mission follow on each other, in any order of the maps; where both are, the earlier map's states count.
     Missions of maps without a known place keep it as a guess, until something anchors them.
+    Of regions of one name and kind that several maps have, the earlier map's counts.
 
     Raises:
         MapError: If two maps hold one mission with different content where both are, or parts of one that share no
@@ -140,6 +144,7 @@ def _content(map_: Map, mission_id: str) -> dict[str, bytes]:
         alone,
         missions=missions,
         frames=Frames(),
+        regions=Regions(),  # what people call places is no part of a mission
         projections=Projections(),
         journal=Journal(),
     )

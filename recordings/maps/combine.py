@@ -8,10 +8,12 @@ from dataclasses import replace
 
 import numpy as np
 
+from mapstream.recordings.maps.columns import IdArray
 from mapstream.recordings.maps.ids import as_keys
 from mapstream.recordings.maps.model import TABLES, Map, from_tables
 from mapstream.recordings.maps.rows import concatenate, shifted
 from mapstream.recordings.maps.tables import Journal
+from mapstream.streams.arrays import BoolArray
 from mapstream.streams.errors import MapError
 
 
@@ -36,6 +38,7 @@ def merge_maps(maps: Sequence[Map], *, share_frame: bool = False) -> Map:
 
     Each map has a frame of its own: unless they share one, missions of the second map and of those after
     it keep their place as a guess that is not known, until something anchors them.
+    Of regions of one name and kind the earlier map's counts.
 
     Raises:
         MapError: If two maps hold the same mission.
@@ -49,9 +52,16 @@ def merge_maps(maps: Sequence[Map], *, share_frame: bool = False) -> Map:
         merged = from_tables(
             {name: concatenate([old, shifted(new, num_rows)]) for name, old, new in pairs}
         )
-    first = np.unique(as_keys(merged.projections.id), return_index=True)[1]
-    merged = merged.select(projections=np.isin(np.arange(len(merged.projections)), first))
+    merged = merged.select(
+        projections=_is_first(merged.projections.id), regions=_is_first(merged.regions.id)
+    )
     return _with_each_frame_once(merged)
+
+
+def _is_first(ids: IdArray) -> BoolArray:
+    """Return which rows (N,) have an id that no earlier one has."""
+    first = np.unique(as_keys(ids), return_index=True)[1]
+    return np.isin(np.arange(len(ids)), first)
 
 
 def _with_each_frame_once(map_: Map) -> Map:

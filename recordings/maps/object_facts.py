@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from mapstream.recordings.maps.model import Map
-from mapstream.recordings.maps.object_payload import object_payload, payload_bytes
+from mapstream.recordings.maps.object_payload import object_payload, payload_bytes, payload_of
 from mapstream.streams.arrays import IntArray
 
 
@@ -40,16 +39,8 @@ def with_facts_of(map_: Map, edges: IntArray) -> Map:
 
 def _facts(map_: Map, edge: int) -> dict[str, Any]:
     """Return the extent and the text that a measurement of a landmark gives."""
-    data = map_.edges.payload[edge]
-    if map_.edges.landmark_a[edge] < 0 or not data:
-        return {}
-    try:
-        given = json.loads(data)
-    except ValueError:  # of another program
-        return {}
-    if not isinstance(given, dict):
-        return {}
-    facts = {}
+    given = payload_of(map_.edges.payload[edge]) if map_.edges.landmark_a[edge] >= 0 else {}
+    facts: dict[str, Any] = {}
     if isinstance(given.get("text"), str):
         facts["text"] = given["text"]
     extent_m = given.get("extent_m")

@@ -17,12 +17,15 @@ from mapstream.graph.cli.map.landmarks import add_verbs, optimize_visual
 from mapstream.graph.cli.map.look import check, cloud_quality, picture, stats, view
 from mapstream.graph.cli.map.loops import close_loops, fix_stationary, loops
 from mapstream.graph.cli.map.moving import remove_moving_
+from mapstream.graph.cli.map.naming import label, unlabel, where
 from mapstream.graph.cli.map.parts import merge, remove
 from mapstream.graph.cli.map.places import summarize
+from mapstream.graph.cli.map.regions import region
 from mapstream.graph.cli.map.registration import find_places, register
 from mapstream.graph.cli.map.solve import optimize, relax
 from mapstream.graph.cli.map.surveys import elevation_, tiles
 
+_WITH_POINTS = {"ignore_unknown_options": True}  # -1,0,0 is no option
 app = typer.Typer(
     help="Work on a map: `mapstream map DIR COMMAND`.", no_args_is_help=True, rich_markup_mode=None
 )
@@ -66,6 +69,10 @@ app.command("anchor")(anchor)
 app.add_typer(edit, name="edit")
 app.command("remove")(remove)
 app.command("merge")(merge)
+app.command("label", context_settings=_WITH_POINTS)(label)
+app.command("unlabel", context_settings=_WITH_POINTS)(unlabel)
+app.command("where")(where)
+app.add_typer(region, name="region")
 app.command("grid")(grid)
 app.command("summarize")(summarize)
 app.command("clsm", hidden=True)(summarize)

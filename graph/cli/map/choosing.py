@@ -7,6 +7,7 @@ from typing import Annotated
 import numpy as np
 import typer
 
+from mapstream.streams.arrays import FloatArray
 from mapstream.streams.errors import ConfigError
 from mapstream.streams.geometry import SE3
 
@@ -31,3 +32,18 @@ def pose_of(text: str) -> SE3:
     if len(numbers) != 7 or not np.isfinite(numbers).all() or not np.any(numbers[3:]):
         raise ConfigError(f"expected x,y,z or x,y,z,qx,qy,qz,qw, found {text!r}")
     return SE3.from_quat_xyzw(numbers[3:], numbers[:3])
+
+
+def point_of(text: str) -> FloatArray:
+    """Return the point (3,) that is written as x,y,z [m].
+
+    Raises:
+        ConfigError: If it is written in another way.
+    """
+    try:
+        point = np.array([float(word) for word in text.split(",")])
+    except ValueError:
+        point = np.empty(0)
+    if len(point) != 3 or not np.isfinite(point).all():
+        raise ConfigError(f"expected x,y,z, found {text!r}")
+    return point
