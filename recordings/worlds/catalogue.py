@@ -11,9 +11,11 @@ from pydantic import BaseModel, ValidationError
 
 from mapstream.recordings.attached_rig import attach_rig
 from mapstream.recordings.mcap_whole import whole_mcap
+from mapstream.recordings.worlds.mr_config import WMrConfig
 from mapstream.recordings.worlds.simulation import Simulation
 from mapstream.recordings.worlds.w_2d import W2dConfig, w_2d
 from mapstream.recordings.worlds.w_lid import WLidConfig, w_lid
+from mapstream.recordings.worlds.w_mr import w_mr
 from mapstream.recordings.worlds.w_pan import WPanConfig, w_pan
 from mapstream.recordings.worlds.w_rgbd import WRgbdConfig, w_rgbd
 from mapstream.recordings.worlds.w_vi import WViConfig, w_vi
@@ -33,6 +35,7 @@ WORLDS = {
     "w_lid": World("a loop of corridors, LiDAR, IMU, drifting odometry", WLidConfig, w_lid),
     "w_2d": World("an office, planar laser, wheels that slip, the plan", W2dConfig, w_2d),
     "w_rgbd": World("a room with a table, colour and depth camera, IMU", WRgbdConfig, w_rgbd),
+    "w_mr": World("a building, robots of four kinds and eleven ways", WMrConfig, w_mr),
     "w_vi": World("a hall, five cameras, IMU, drifting odometry, GPS and tags", WViConfig, w_vi),
     "w_pan": World("a room, a depth camera that pans and tilts, /tf", WPanConfig, w_pan),
 }

@@ -65,6 +65,19 @@ class Lens:
         blurred: Picture = np.rint(mean).astype(np.uint8)
         return blurred
 
+    def surfaces(self, T_world_camera: FloatArray) -> IntArray:
+        """Return which surface each pixel (H, W) of a global shutter shows, from a pose (4, 4)."""
+        parts = [self._shown(band, T_world_camera) for band in self._bands]
+        return np.concatenate(parts)
+
+    def _shown(self, band: _Band, T_world_camera: FloatArray) -> IntArray:
+        shown = self._renderer.surfaces_seen(band.pinhole, T_world_camera)
+        if not band.look_up.size:
+            return shown
+        small = shown.astype(np.int16)  # what OpenCV can bend
+        bent = cv2.remap(small, band.look_up[0], band.look_up[1], cv2.INTER_NEAREST)
+        return bent.astype(np.int64)
+
     def _sharp(self, poses: FloatArray) -> Picture:
         parts = [self._part(band, T) for band, T in zip(self._bands, poses, strict=True)]
         return parts[0] if len(parts) == 1 else np.concatenate(parts)

@@ -10,9 +10,9 @@ import numpy as np
 from mapstream.recordings.worlds.motion import Motion
 from mapstream.recordings.worlds.office import CORE_M, CORRIDOR_M, Office, Room
 from mapstream.recordings.worlds.sway import RAMP_S, REST_S, from_rest
+from mapstream.recordings.worlds.way import STEP_M, smoothed
 from mapstream.streams.arrays import FloatArray
 
-_STEP_M = 0.02  # between points of the way
 _ROUND_M, _TURN_M = 0.35, 0.5  # standard deviations that smooth the way, and the headings along it
 _SWAY_M, _SWAY_RAD = 0.06, 0.12
 _STATION = tuple[float, float, float]  # x, y [m], heading [rad]
@@ -38,9 +38,9 @@ def office_drive(floor: Office, route: Route, start_ns: int, rng: np.random.Gene
         stations = _reversed(stations)
     legs = np.linalg.norm(np.diff(stations[:, :2], axis=0), axis=1)
     reached = np.concatenate([[0.0], np.cumsum(legs)])
-    way = np.arange(0.0, reached[-1], _STEP_M)
-    x, y = (_smoothed(np.interp(way, reached, stations[:, k]), _ROUND_M) for k in (0, 1))
-    heading = _smoothed(np.interp(way, reached, stations[:, 2]), _TURN_M)
+    way = np.arange(0.0, reached[-1], STEP_M)
+    x, y = (smoothed(np.interp(way, reached, stations[:, k]), _ROUND_M) for k in (0, 1))
+    heading = smoothed(np.interp(way, reached, stations[:, 2]), _TURN_M)
     start = from_rest(way[-1] / route.speed_mps + REST_S + RAMP_S / 2, start_ns)
     at = np.clip(start.moved_s * route.speed_mps, 0.0, way[-1])
     phases = rng.uniform(0, 2 * np.pi, 2)
@@ -112,13 +112,3 @@ def _reversed(stations: FloatArray) -> FloatArray:
     back = stations[::-1].copy()
     back[:, 2] += np.pi - back[0, 2]
     return back
-
-
-def _smoothed(values: FloatArray, sigma_m: float) -> FloatArray:
-    """Return values along the way (N,) with a Gaussian over their neighbours; the first one stays."""
-    reach = round(4 * sigma_m / _STEP_M)
-    kernel = np.exp(-0.5 * (np.arange(-reach, reach + 1) * _STEP_M / sigma_m) ** 2)
-    padded = np.pad(values, (reach, 0), mode="reflect", reflect_type="odd")
-    padded = np.pad(padded, (0, reach), mode="edge")
-    smooth: FloatArray = np.convolve(padded, kernel / kernel.sum(), mode="valid")
-    return smooth

@@ -111,6 +111,17 @@ class Renderer:
             patch.part(surfaces)[mask] = patch.surface
         return Rendering(image, depths, surfaces)
 
+    def surfaces_seen(self, camera: Pinhole, T_world_camera: FloatArray) -> IntArray:
+        """Return what is seen from a pose (4, 4), as in a `Rendering`, without drawing it."""
+        width, height = camera.size_px
+        depths = np.zeros((height, width), np.float32)
+        surfaces = np.full((height, width), -1, np.int64)
+        for patch in self._patches(camera, T_world_camera):
+            mask = patch.mask()
+            patch.test_depth(mask, depths)
+            patch.part(surfaces)[mask] = patch.surface
+        return surfaces
+
     def _blank(self, camera: Pinhole) -> Picture:
         width, height = camera.size_px
         return np.zeros((height, width, *self.surfaces[0].picture.shape[2:]), np.uint8)
@@ -212,6 +223,8 @@ class _Patch:
 
     def draw(self, mask: BoolArray, picture: Picture, image: Picture) -> None:
         """Copy the picture to the mask."""
+        if not mask.any():  # all of it is hidden
+            return
         height, width = mask.shape
         drawn = cv2.warpPerspective(
             picture,

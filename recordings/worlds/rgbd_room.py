@@ -8,8 +8,9 @@ from functools import partial
 
 import numpy as np
 
-from mapstream.recordings.worlds.paint import Painter, Picture
-from mapstream.recordings.worlds.surfaces import Paint, Surface, box_outline, prism, shell
+from mapstream.recordings.worlds.paint import Painter
+from mapstream.recordings.worlds.room_paint import ceiling, floor, one_color, wall
+from mapstream.recordings.worlds.surfaces import Surface, box_outline, prism, shell
 from mapstream.recordings.worlds.things import Thing
 from mapstream.streams.arrays import FloatArray
 from mapstream.streams.geometry import SE3, so3_exp
@@ -40,63 +41,26 @@ def rgbd_room(seed: int, *, texel_m: float) -> Room:
     painter = Painter(rng, texel_m, is_colored=True)
     things = _things(rng)
     surfaces = [
-        *shell(_SIZE_M, *(partial(paint, painter) for paint in (_wall, _floor, _ceiling))),
+        *shell(_SIZE_M, *(partial(paint, painter) for paint in (wall, floor, ceiling))),
         *_furniture(painter),
     ]
     fine = Painter(rng, texel_m / 2, is_colored=True)  # seen from near
     for thing in things:
-        paint = _one_color(fine, rng.uniform(60, 220), 60, 1500)
+        paint = one_color(fine, rng.uniform(60, 220), 60, 1500)
         surfaces += prism(thing.name, thing.T_world_thing, thing.outline_m, thing.height_m, paint)
     return Room(tuple(surfaces), things)
 
 
-def _wall(painter: Painter, size_m: tuple[float, float]) -> Picture:
-    picture = painter.blank(size_m, painter.color(painter.rng.uniform(160, 205), 18))
-    painter.plaster(picture, 12)
-    painter.leaves(picture, round(25 * size_m[0] * size_m[1]), (0.015, 0.2))
-    painter.posters(picture, round(8 * size_m[0]), (0.3, 0.9))
-    return picture
-
-
-def _floor(painter: Painter, size_m: tuple[float, float]) -> Picture:
-    picture = painter.blank(size_m, painter.color(105, 25))
-    painter.tiles(picture, 0.35, 14, -40)
-    painter.plaster(picture, 12)
-    painter.leaves(picture, round(30 * size_m[0] * size_m[1]), (0.015, 0.25))
-    return picture
-
-
-def _ceiling(painter: Painter, size_m: tuple[float, float]) -> Picture:
-    picture = painter.blank(size_m, painter.color(215, 5))
-    painter.plaster(picture, 5)
-    painter.lamps(picture, 2.2, (0.9, 0.2))
-    return picture
-
-
-def _one_color(painter: Painter, level: float, spread: float, leaves_per_m2: float) -> Paint:
-    """Return the paint of one thing: all its sides have one colour, and leaves on it."""
-    color = painter.color(level, spread)
-
-    def paint(size_m: tuple[float, float]) -> Picture:
-        picture = painter.blank(size_m, color)
-        painter.plaster(picture, 12)
-        count = round(leaves_per_m2 * size_m[0] * size_m[1])
-        painter.leaves(picture, count + 6, (0.008, 0.12))
-        return picture
-
-    return paint
-
-
 def _furniture(painter: Painter) -> list[Surface]:
     """Return the table, a cupboard and two crates."""
-    wood = _one_color(painter, 150, 25, 80)
+    wood = one_color(painter, 150, 25, 80)
     length, width = _TABLE_M
     legs_m = TABLE_HEIGHT_M - _BOARD_M
     surfaces = prism("table", _at(0, 0, legs_m), box_outline(length, width), _BOARD_M, wood)
     x, y = length / 2 - _LEG_M, width / 2 - _LEG_M
     for corner in ((x, y), (-x, y), (-x, -y), (x, -y)):
         surfaces += prism("table", _at(*corner, 0), box_outline(_LEG_M, _LEG_M), legs_m, wood)
-    dark = _one_color(painter, 90, 20, 80)
+    dark = one_color(painter, 90, 20, 80)
     surfaces += prism("cupboard", _at(-2.1, 1.93, 0), box_outline(0.9, 0.5), 1.8, dark)
     surfaces += prism("crate", _at(2.2, -1.7, 0, 0.3), box_outline(0.45, 0.5), 0.55, dark)
     return [*surfaces, *prism("crate", _at(2.25, 1.75, 0), box_outline(0.5, 0.5), 0.9, dark)]

@@ -124,6 +124,11 @@ class ImuSeries:
     accel_biases_mps2: FloatArray  # (N, 3)
     T_base_sensor: SE3
 
+    def biases_at(self, stamp_ns: int) -> tuple[FloatArray, FloatArray]:
+        """Return the biases of the gyroscope and the accelerometer (3,) at a time."""
+        row = min(int(np.searchsorted(self.stamps_ns, stamp_ns)), len(self.stamps_ns) - 1)
+        return self.gyro_biases_radps[row], self.accel_biases_mps2[row]
+
     def batches(self) -> Iterator[ImuBatch]:
         """Yield a tenth of a second at a time."""
         period_ns = int(self.stamps_ns[1] - self.stamps_ns[0])

@@ -14,10 +14,9 @@ import cv2
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, NonNegativeFloat, PositiveInt
 
-from mapstream.recordings.worlds.renderer import Rendering
 from mapstream.recordings.worlds.surfaces import Surface
 from mapstream.recordings.worlds.things import Thing
-from mapstream.streams.arrays import BoolArray, FloatArray
+from mapstream.streams.arrays import BoolArray, FloatArray, IntArray
 from mapstream.streams.geometry import SE3
 from mapstream.streams.messages.objects import ObjectDetections, window
 
@@ -99,16 +98,24 @@ class SimulatedDetector:
 
     def detect(
         self,
-        view: Rendering,
+        surfaces: IntArray,
         things: Sequence[Thing],
         T_world_camera: FloatArray,
         number: int,
         stamp_ns: int,
     ) -> Detected:
-        """Return what is detected in an image with a number; the things are those of the start, where they are now."""
+        """Return what is detected in an image with a number.
+
+        Args:
+            surfaces: Which one each pixel (H, W) shows, as in a `Rendering`.
+            things: Those of the start, where they are now.
+            T_world_camera: Shape (4, 4).
+            number: Of the image.
+            stamp_ns: Of the image.
+        """
         rng, config = np.random.default_rng((self._seed, _SEED, number)), self._config
         found, missed = [], []
-        owner = self._thing_of[view.surfaces]
+        owner = self._thing_of[surfaces]
         pixels = np.bincount(owner.ravel() + 1, minlength=len(things) + 1)[1:]
         for row in np.flatnonzero(pixels >= config.min_pixels).tolist():
             seen = self._seen(things[row], owner == row)
@@ -118,7 +125,9 @@ class SimulatedDetector:
             found.append(seen)
             if rng.random() < config.duplicates:
                 found.append(replace(seen, score=seen.score - _LESS))
-        found += [self._imagined(view, rng) for _ in range(rng.poisson(config.false_per_image))]
+        found += [
+            self._imagined(owner.shape, rng) for _ in range(rng.poisson(config.false_per_image))
+        ]
         erred = [self._erred(each, rng) for each in found]
         order = np.argsort([-each.score for each in erred], kind="stable")
         ranked = [erred[row] for row in order]
@@ -151,9 +160,9 @@ class SimulatedDetector:
             thing=thing, label=thing.label, score=self._config.score, box_px=box, mask=mask
         )
 
-    def _imagined(self, view: Rendering, rng: np.random.Generator) -> _Found:
+    def _imagined(self, shape: tuple[int, int], rng: np.random.Generator) -> _Found:
         """Return a detection of nothing, an ellipse somewhere in the image."""
-        height, width = view.surfaces.shape
+        height, width = shape
         half = rng.uniform(*_FALSE_SIZES, 2) * width / 2
         middle = rng.uniform(0, [width, height])
         mask = np.zeros((height, width), np.uint8)

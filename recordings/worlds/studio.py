@@ -42,13 +42,15 @@ class Studio:
         renderer: Renderer,
         motion: Motion,
         seed: int,
+        places: Mapping[CameraName, SE3] = T_BASE_CAMERA,
     ) -> None:
-        """Set up the cameras that have a claim: where the recording says that they sit.
+        """Set up the cameras that have a claim: where the recording says that they sit, and where they do.
 
         Raises:
             ConfigError: If a lens cannot be drawn.
         """
         self._config, self._claims, self._motion = config, claims, motion
+        self._places = places
         shape = (config.height_px, config.width_px)
         try:
             self._lenses = {name: Lens(renderer, config.calibration(name)) for name in claims}
@@ -92,5 +94,5 @@ class Studio:
         if exposure_ns:
             moments = np.linspace(-0.5, 0.5, self._config.blur_samples) * exposure_ns
         stamps_ns = shot.taken_ns + np.rint(moments)[:, None].astype(np.int64) + lens.offsets_ns
-        T_world_camera = self._motion.poses(stamps_ns.ravel()) @ T_BASE_CAMERA[shot.camera].matrix
+        T_world_camera = self._motion.poses(stamps_ns.ravel()) @ self._places[shot.camera].matrix
         return lens.image(T_world_camera.reshape(*stamps_ns.shape, 4, 4))

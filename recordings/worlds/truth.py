@@ -31,18 +31,20 @@ def stamps_at(rate_hz: float, span_ns: tuple[int, int]) -> IntArray:
     return stamps
 
 
-def true_odometry(motion: Motion, imu: ImuSeries, span_ns: tuple[int, int]) -> Iterator[Odometry]:
-    """Yield poses of the base in the world, its velocities there, and the IMU's biases."""
+def true_odometry(
+    motion: Motion, imu: ImuSeries | None, span_ns: tuple[int, int]
+) -> Iterator[Odometry]:
+    """Yield poses of the base in the world, its velocities there, and the IMU's biases if there is one."""
     stamps_ns = stamps_at(_RATE_HZ, span_ns)
-    rows = np.clip(np.searchsorted(imu.stamps_ns, stamps_ns), 0, len(imu.stamps_ns) - 1)
     poses, velocities = motion.poses(stamps_ns), motion.velocities(stamps_ns)
-    for stamp_ns, row, T, velocity in zip(stamps_ns.tolist(), rows, poses, velocities, strict=True):
+    for stamp_ns, T, velocity in zip(stamps_ns.tolist(), poses, velocities, strict=True):
+        gyro, accel = (None, None) if imu is None else imu.biases_at(stamp_ns)
         yield Odometry(
             stamp_ns=stamp_ns,
             T_odom_base=SE3(T),
             velocity_mps=velocity,
-            gyro_bias_radps=imu.gyro_biases_radps[row],
-            accel_bias_mps2=imu.accel_biases_mps2[row],
+            gyro_bias_radps=gyro,
+            accel_bias_mps2=accel,
         )
 
 

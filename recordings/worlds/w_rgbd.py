@@ -146,7 +146,7 @@ def _records(
         yield Record(stamp_ns, "/points", world.camera.cloud(color, depth))
     if detector is not None:
         things = [*world.room.things, *world.people.things(stamp_ns, T_world_camera)]
-        detected = detector.detect(view, things, T_world_camera, number, stamp_ns)
+        detected = detector.detect(view.surfaces, things, T_world_camera, number, stamp_ns)
         yield Record(stamp_ns, "/color/objects", detected.detections)
         yield Record(stamp_ns, "/truth/objects", detected.truth)
 
