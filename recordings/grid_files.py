@@ -153,7 +153,7 @@ def _cells(grey: npt.NDArray[Any], described: _Described) -> npt.NDArray[np.int8
     is_clear = grey[..., 1] < 255 if grey.ndim == 3 else np.zeros(grey.shape, bool)
     grey = grey[..., 0] if grey.ndim == 3 else grey
     if described.mode == "raw":
-        return np.where(grey <= OCCUPIED, grey, UNKNOWN).astype(np.int8)
+        return np.where(grey <= OCCUPIED, grey.astype(np.int16), UNKNOWN).astype(np.int8)
     share = grey / 255 if described.negate else (255 - grey) / 255.0
     is_occupied, is_free = share > described.occupied_thresh, share < described.free_thresh
     between = np.full(share.shape, float(UNKNOWN))
