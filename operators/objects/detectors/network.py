@@ -90,7 +90,8 @@ class DetectorNetwork:
         keeps_size = layout.keeps_size and not any(isinstance(n, int) for n in self._shape[-2:])
         width, height = sizes_px[0] if keeps_size else self._size_px
         fits = [ImageFit.of(size_px, (width, height), layout.fit) for size_px in sizes_px]
-        planes = np.zeros((batch, _CHANNELS, height, width), np.float32)
+        planes = np.empty((batch, _CHANNELS, height, width), np.float32)
+        planes[len(frames) :] = 0.0  # of a batch that is not full
         for frame, fit, plane in zip(frames, fits, planes, strict=False):
             fit.planes(frame, plane, is_rgb=layout.is_rgb, pad=layout.pad)
         if layout.most != 255.0:
