@@ -15,7 +15,7 @@ from mapstream.graph.plan import Plan
 from mapstream.graph.tap_outputs import Output
 from mapstream.graph.views.run import GRAPH, graph_extent
 from mapstream.recordings.maps import Map
-from mapstream.streams.messages import estimates, grids, sensors, vision
+from mapstream.streams.messages import estimates, grids, objects, sensors, vision
 
 _IN_SPACE = (
     sensors.LidarScan,
@@ -33,16 +33,17 @@ _IN_SPACE = (
     Map,
 )
 _PICTURES = (sensors.CameraFrame, sensors.EncodedImage)
+_OVER_PICTURES = (vision.ImageFeatures, objects.ObjectDetections)
 _KNOWN = (
     *_IN_SPACE,
     *_PICTURES,
+    *_OVER_PICTURES,
     sensors.ImuBatch,
     sensors.GnssFix,
     sensors.TransformBatch,
-    vision.ImageFeatures,
     vision.NFrame,
 )
-POINTS = "points"  # below the path of keypoints: where they are in space
+POINTS = "points"  # below the path of keypoints and objects: where they are in space
 CLOSED = (rrb.BlueprintPanel(state="collapsed"), rrb.SelectionPanel(state="collapsed"))
 _HIDDEN = rrb.EntityBehavior(visible=False)
 
@@ -54,7 +55,7 @@ def blueprint_of(plan: Plan, outputs: Sequence[Output]) -> rrb.Blueprint:
     operators = rrb.GraphView(origin=GRAPH, name="Operators", visual_bounds=bounds)
     space = [output for output in outputs if output.sends(*_IN_SPACE)]
     cameras = _cameras(plan, outputs)
-    features = [output.path for output in outputs if output.sends(vision.ImageFeatures)]
+    features = [output.path for output in outputs if output.sends(*_OVER_PICTURES)]
     large = (
         [map_view(space, features=features)] if space else cameras
     )  # without a map the images are what there is to see
@@ -80,7 +81,7 @@ def map_view(
 ) -> rrb.Spatial3DView:
     """Return the view of all that has a place, seen from the map's frame; some is drawn once it is ticked.
 
-    Of outputs with keypoints, named by their paths, the 3D points are shown.
+    Of outputs with keypoints or objects, named by their paths, what is known in space is shown.
     """
     has_clouds = any(output.sends(estimates.PointCloud) for output in outputs)
     hidden = [o.path for o in outputs if o.sends(estimates.Keyframe)]
@@ -92,7 +93,7 @@ def map_view(
         contents=[
             "+ /map/**",
             *(f"+ /{output.path}/**" for output in outputs),
-            *(f"+ /{path}/{POINTS}" for path in features),
+            *(f"+ /{path}/{POINTS}/**" for path in features),
         ],
         overrides=dict.fromkeys((*hidden_paths, *(f"/{path}" for path in hidden)), _HIDDEN),
         eye_controls=eye,
@@ -102,14 +103,20 @@ def map_view(
 
 
 def _cameras(plan: Plan, outputs: Sequence[Output]) -> list[rrb.View]:
-    """Return a view per camera, with all features that were found in its pictures."""
-    features = [output for output in outputs if output.sends(vision.ImageFeatures)]
+    """Return a view per camera, with all features and objects that were found in its pictures.
+
+    Objects that were recorded with the pictures are drawn over all of them.
+    """
+    features = [output for output in outputs if output.sends(*_OVER_PICTURES)]
     views: list[rrb.View] = []
     for picture in (output for output in outputs if output.sends(*_PICTURES)):
-        made_of_it = _made_of(plan, (picture.edge.from_node, picture.edge.from_port))
+        source = picture.edge.from_node
+        made_of_it = _made_of(plan, (source, picture.edge.from_port))
+        recorded = [f.edge for f in features if f.edge.from_node == source]
+        made_of_it = made_of_it.union(*(_made_of(plan, (source, e.from_port)) for e in recorded))
         found = [f for f in features if (f.edge.from_node, f.edge.from_port) in made_of_it]
         contents = [f"+ /{output.path}/**" for output in (picture, *found)]
-        contents += [f"- /{output.path}/{POINTS}" for output in found]
+        contents += [f"- /{output.path}/{POINTS}/**" for output in found]
         views.append(rrb.Spatial2DView(name=picture.path, origin="/", contents=contents))
     return views
 

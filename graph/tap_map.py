@@ -82,6 +82,7 @@ def _draw_pictures(map_: Map, mission: int, sink: Sink, scene: Scene) -> list[st
     """Draw what a mission's cameras saw, where the recording is at hand, and the map over it; return what is missing."""
     from mapstream.graph.views import view_of  # noqa: PLC0415  # imports rerun
     from mapstream.graph.views.drive import picture_path  # noqa: PLC0415
+    from mapstream.graph.views.objects import map_detections  # noqa: PLC0415
     from mapstream.graph.views.overlay import overlay_entries  # noqa: PLC0415
 
     cameras = cameras_of(map_, mission)
@@ -97,6 +98,7 @@ def _draw_pictures(map_: Map, mission: int, sink: Sink, scene: Scene) -> list[st
             drawing = [*view_of(message)(message, scene)]
             if camera := cameras.get(message.frame):
                 drawing += overlay_entries(map_, camera, message.frame, vertex)
+                drawing += map_detections(map_, message.frame, vertex, scene)
             sink.draw(path, drawing, stamp_ns=stamp_ns, sequence=sequence)
             if sequence % _PICTURES_AT_ONCE == 0 and not sink.flush(_FLUSH_S):
                 raise MapError(f"rerun: the viewer did not take pictures within {_FLUSH_S:.0f} s")

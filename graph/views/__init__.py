@@ -41,13 +41,22 @@ from mapstream.graph.views.motion import (
     view_transforms,
     view_wheel_odometry,
 )
+from mapstream.graph.views.objects import view_object_detections
 from mapstream.graph.views.planes import view_plane_segments
 from mapstream.graph.views.run import operator_graph, view_snapshot
 from mapstream.graph.views.scene import Columns, Entry, Scene, View, ViewSettings
 from mapstream.graph.views.tracks import view_image_features, view_n_frame
 from mapstream.graph.views.unknown import view_unknown
 from mapstream.recordings.maps import Map
-from mapstream.streams.messages import constraints, estimates, grids, planes, sensors, vision
+from mapstream.streams.messages import (
+    constraints,
+    estimates,
+    grids,
+    objects,
+    planes,
+    sensors,
+    vision,
+)
 
 __all__ = [
     "GROUP",
@@ -81,6 +90,7 @@ _BUILT_IN: dict[type, View] = {
     estimates.MapCorrection: view_map_correction,
     estimates.MapPose: view_map_pose,
     grids.OccupancyGrid: view_occupancy_grid,
+    objects.ObjectDetections: view_object_detections,
     planes.PlaneSegments: view_plane_segments,
     vision.ImageFeatures: view_image_features,
     vision.NFrame: view_n_frame,

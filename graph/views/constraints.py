@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import rerun as rr
 
+from mapstream.graph.views.objects import view_recognised
 from mapstream.graph.views.planes import view_plane_constraint
 from mapstream.graph.views.scene import MAP, Drawing, Entry, Scene, placed
 from mapstream.graph.views.unknown import view_unknown
@@ -15,9 +16,11 @@ _MEASURED = 0xE69F00FF
 
 
 def view_constraint(constraint: Constraint, scene: Scene) -> Drawing:
-    """Draw where the robot was seen, in the outer frame, or the plane it saw; other kinds as numbers."""
+    """Draw where the robot was seen, in the outer frame, or the plane or thing it saw; other kinds as numbers."""
     if constraint.kind == "plane":
         return view_plane_constraint(constraint, scene)
+    if constraint.kind == "landmark":
+        return view_recognised(constraint, scene)
     if constraint.kind not in ("position", "absolute"):
         return view_unknown(constraint, scene)
     path, points = scene.line("places", constraint.T_a_b.t)

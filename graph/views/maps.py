@@ -14,6 +14,7 @@ from mapstream.graph.views.landmarks import landmark_entries
 from mapstream.graph.views.lidar import height_colors
 from mapstream.graph.views.observers import observer_entries
 from mapstream.graph.views.outer_frames import outer_frame_entries
+from mapstream.graph.views.regions import region_entries
 from mapstream.graph.views.scene import Columns, Drawing, Entry, Scene, Vertex
 from mapstream.recordings.maps import Map
 from mapstream.streams.messages.estimates import PointCloud
@@ -26,7 +27,7 @@ def view_map(map_: Map, scene: Scene) -> Drawing:
     """Draw all that a map holds.
 
     That is each mission's trajectory, robot and states, loops by switch value, other edges and landmarks by kind,
-    from where landmarks were seen, and outer frames.
+    from where landmarks were seen, regions, and outer frames.
     """
     drawing: list[Entry | Columns] = []
     for row in range(len(map_.missions)):
@@ -39,6 +40,7 @@ def view_map(map_: Map, scene: Scene) -> Drawing:
         scene.loops[ends] = float(edges.switch[edge])
     drawing += [*redraw_loops(scene), *place_frames(map_)]
     drawing += [*_edges(map_), *landmark_entries(map_), *observer_entries(map_)]
+    drawing += region_entries(map_)
     return [*drawing, *outer_frame_entries(map_), *drive_entries(map_)]
 
 
