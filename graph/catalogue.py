@@ -66,6 +66,7 @@ BUILT_IN = {
     "localize": "mapstream.operators.places.localize:Localize",
     "localize_lidar": "mapstream.operators.lidar.places.localize_lidar:LocalizeLidar",
     "localize_planes": "mapstream.operators.planes.localize_planes:LocalizePlanes",
+    "loop_reports": "mapstream.operators.backend.loop_reports:LoopReports",
     "map_overlay": "mapstream.operators.images.map_overlay:MapOverlay",
     "map_steps": "mapstream.operators.maps.steps:MapSteps",
     "map_store": "mapstream.operators.sinks.map_store:MapStore",
