@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from pydantic import Field, NonNegativeFloat
+from pydantic import Field, NonNegativeFloat, PositiveFloat
 
 from mapstream.operators.landmarks.locating import FOUND
 from mapstream.operators.objects.landmarks.placing import Place, Places, PlacingConfig
@@ -30,6 +30,9 @@ class SameConfig(PlacingConfig):
     """And in addition so much of how large they look: one sees the near side of things."""
     min_duplicate_overlap: float = Field(default=0.7, gt=0, le=1)
     """Two boxes in one image are of one thing if so much of the smaller one lies in the other."""
+    max_gap_s: PositiveFloat | None = None
+    """What a mission saw again only after so long stays another thing, which loop closure compares with the first:
+    odometry drifted meanwhile."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -140,8 +143,16 @@ class Matcher:
     def _can_be_one(self, a: Thing, b: Thing) -> bool:
         if not a.missions & b.missions or (a.text and b.text and a.text != b.text):
             return False
+        if self._gap_s(a, b) > (self._config.max_gap_s or np.inf):
+            return False
         least = self._config.min_duplicate_overlap
         return not seen_apart(self._sightings, a.members, b.members, least)
+
+    def _gap_s(self, a: Thing, b: Thing) -> float:
+        """Return how long neither of two things was seen, between them; not positive if there is no such time."""
+        stamps_a, stamps_b = (self._sightings.stamps_ns[thing.members] for thing in (a, b))
+        gap_ns = max(stamps_a.min(), stamps_b.min()) - min(stamps_a.max(), stamps_b.max())
+        return float(gap_ns) / 1e9
 
     def _miss(self, thing: Thing, part: Thing) -> float:
         """Return by how much [sigma] rays pass a thing; infinite if it would look much larger or smaller."""

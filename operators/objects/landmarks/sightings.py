@@ -21,6 +21,7 @@ class Sightings:
 
     detections: IntArray  # (N,) rows
     views: Views  # of their observations: rays and points in the map frame
+    stamps_ns: IntArray  # (N,)
     images: IntArray  # (N,) numbers of images
     missions: IntArray  # (N,) rows
     tracks: IntArray  # (N,) -1: none
@@ -51,6 +52,7 @@ def sightings_of(map_: Map) -> Sightings:
     return Sightings(
         detections=order,
         views=views,
+        stamps_ns=stamps_ns[order],
         images=np.unique(moments, axis=1, return_inverse=True)[1].ravel().astype(np.int64),
         missions=missions[order],
         tracks=seen.track[rows],
