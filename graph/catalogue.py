@@ -77,6 +77,7 @@ BUILT_IN = {
     "network_tracker": "mapstream.operators.networks.network_tracker:NetworkTracker",
     "object_detector": "mapstream.operators.objects.object_detector:ObjectDetector",
     "object_features": "mapstream.operators.objects.object_features:ObjectFeatures",
+    "object_masks": "mapstream.operators.objects.masks.object_masks:ObjectMasks",
     "object_measurements": "mapstream.operators.objects.object_measurements:ObjectMeasurements",
     "object_tracker": "mapstream.operators.objects.tracking.object_tracker:ObjectTracker",
     "occupancy_grid": "mapstream.operators.laser.occupancy_grid:OccupancyGrids",

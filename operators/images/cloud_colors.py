@@ -13,17 +13,16 @@ from pydantic import Field, PositiveFloat, PositiveInt
 
 from mapstream.operators.decode.image import ImageDecode, ImageDecodeConfig
 from mapstream.operators.images.calibrated import require_camera
+from mapstream.operators.odometry.moved import moved
 from mapstream.operators.operator import Operator, OperatorConfig, Placement, offload, warn
 from mapstream.streams.arrays import BoolArray, FloatArray
 from mapstream.streams.calibration import CameraCalibration
 from mapstream.streams.camera_models import project
 from mapstream.streams.channel import Receiver, Sender
 from mapstream.streams.errors import OperatorError
-from mapstream.streams.geometry import SE3
 from mapstream.streams.messages.estimates import Odometry, PointCloud
 from mapstream.streams.messages.sensors import CameraFrame
 from mapstream.streams.sync import anchored, nearest, window
-from mapstream.streams.trajectory import Trajectory
 
 _TO_COLOR = ImageDecode(ImageDecodeConfig(mode="color"))
 
@@ -90,7 +89,7 @@ class CloudColors(Operator[Inputs, Outputs]):
         decoded = _TO_COLOR.decode(frame)
         if not isinstance(decoded, CameraFrame):
             raise OperatorError(f"{frame.frame} gives no colours: {decoded.reason}")
-        T_camera_base = frame.T_base_sensor.inverse() @ _moved(
+        T_camera_base = frame.T_base_sensor.inverse() @ moved(
             odometry, frame.stamp_ns, cloud.stamp_ns
         )
         points = cloud.points.astype(np.float64) @ T_camera_base.R.T + T_camera_base.t
@@ -120,20 +119,6 @@ class CloudColors(Operator[Inputs, Outputs]):
         front_m = around[cells[:, 1], cells[:, 0]]
         in_front: BoolArray = depth_m <= 1.02 * front_m + self._config.hidden_m
         return in_front
-
-
-def _moved(odometry: Sequence[Odometry], to_ns: int, from_ns: int) -> SE3:
-    """Return T_to_from of the base; the identity where no odometry covers both."""
-    if len(odometry) < 2 or to_ns == from_ns:
-        return SE3.identity()
-    path = Trajectory(
-        stamps_ns=np.array([each.stamp_ns for each in odometry]),
-        poses=np.array([each.T_odom_base.matrix for each in odometry]),
-    )
-    if not (path.covers(to_ns) and path.covers(from_ns)):
-        warn("clouds and images beyond the odometry: the robot counts as standing between them")
-        return SE3.identity()
-    return path.pose_at(to_ns).inverse() @ path.pose_at(from_ns)
 
 
 def _sampled(image: npt.NDArray[np.uint8], px: FloatArray) -> npt.NDArray[np.uint8]:

@@ -87,13 +87,16 @@ def _with_landmarks(sightings: Sightings) -> list[_Group]:
 
 
 def _without(sightings: Sightings, groups: list[_Group]) -> list[_Group]:
-    """Return the tracks of which nothing is in a group."""
-    keys = np.stack([sightings.missions, sightings.tracks])
+    """Return the tracks of which nothing is in a group; what has a 3D point and no track is one of its own."""
+    has_point = np.isfinite(sightings.views.points).all(axis=1)
+    numbers = np.arange(len(sightings))
+    keys = np.stack([sightings.missions, np.where(sightings.tracks >= 0, sightings.tracks, -1 - numbers)])
     track = np.unique(keys, axis=1, return_inverse=True)[1].ravel()
     is_done = np.zeros(len(track) + 1, np.bool_)
     for group in groups:
         is_done[track[group.members]] = True
-    left = np.flatnonzero(~is_done[track] & (sightings.tracks >= 0))
+    left = np.flatnonzero(~is_done[track] & ((sightings.tracks >= 0) | has_point))
+    left = left[np.argsort(track[left], kind="stable")]
     cuts = np.flatnonzero(np.diff(track[left])) + 1
     return [_Group(members) for members in np.split(left, cuts) if len(members)]
 

@@ -1,0 +1,1 @@
+"""Which points and pixels in the box of a detection are of the object."""
