@@ -13,6 +13,9 @@ import numpy.typing as npt
 import pyarrow as pa
 from pyarrow import csv
 
+from mapstream.operators.maps.naming import things
+from mapstream.operators.maps.regions import regions_of
+from mapstream.operators.maps.where import described
 from mapstream.recordings.maps.model import Map
 from mapstream.streams.arrays import FloatArray
 from mapstream.streams.errors import RecordingError
@@ -42,6 +45,8 @@ def write_tables(map_: Map, folder: Path) -> dict[Path, int]:
         "landmarks": _landmarks(map_),
         "observations": _observations(map_),
         "imu": _imu(map_),
+        "objects": _objects(map_),
+        "regions": _regions(map_),
     }
     written = {}
     try:
@@ -163,4 +168,39 @@ def _imu(map_: Map) -> Columns:
         "stamp_ns": imu.stamp_ns,
         **_named(_axes("gyro_{}_radps"), imu.gyro_radps),
         **_named(_axes("accel_{}_mps2"), imu.accel_mps2),
+    }
+
+
+def _objects(map_: Map) -> Columns:
+    """Return landmarks that people may ask for: with a class, a name or an outline."""
+    rows = things(map_)
+    found = described(map_, rows.tolist())
+    unknown = np.full(4, np.nan)
+    turns = [unknown if thing.quat_xyzw is None else thing.quat_xyzw for thing in found]
+    sizes = [unknown[:3] if thing.extent_m is None else thing.extent_m for thing in found]
+    return {
+        "landmark": rows,
+        **{
+            column: np.array([getattr(thing, column) for thing in found], dtype=object)
+            for column in ("id", "kind", "label", "name", "text")
+        },
+        **_named(_POSITION, np.array([thing.position for thing in found]).reshape(-1, 3)),
+        **_named(_ROTATION, np.array(turns).reshape(-1, 4)),
+        **_named(_axes("size_{}_m"), np.array(sizes).reshape(-1, 3)),
+        "region": np.array([next(iter(thing.regions), "") for thing in found], dtype=object),
+        "num_observations": np.array([thing.num_observations for thing in found], np.int64),
+    }
+
+
+def _regions(map_: Map) -> Columns:
+    """Return the corners of regions, a row each."""
+    regions = regions_of(map_)
+    counts = [len(region.corners) for region in regions]
+    corners = np.concatenate([np.empty((0, 3)), *(region.corners for region in regions)])
+    return {
+        "region": np.repeat(np.array([r.name for r in regions], dtype=object), counts),
+        "kind": np.repeat(np.array([r.kind for r in regions], dtype=object), counts),
+        "corner": np.concatenate([np.empty(0, np.int64), *map(np.arange, counts)]),
+        **_named(_POSITION, corners),
+        "height_m": np.repeat(np.array([r.height_m for r in regions], np.float64), counts),
     }

@@ -13,6 +13,7 @@ from mapstream.operators.maps.aggregate import AggregateConfig, aggregate_cloud
 from mapstream.operators.maps.colmap import colmap_model
 from mapstream.operators.maps.csv_tables import write_tables
 from mapstream.operators.maps.geo_clouds import projection_of
+from mapstream.operators.maps.geojson import write_geojson
 from mapstream.recordings.cloud_files import write_pcd, write_ply
 from mapstream.recordings.colmap import write_model
 from mapstream.recordings.g2o import write_g2o
@@ -46,7 +47,7 @@ class ExportReport:
 
 
 def export_map(map_: Map, folder: Path, path: Path, config: ExportConfig) -> ExportReport:
-    """Write a map as `.tum`, `.kitti`, `.csv` (EuRoC), `.g2o`, `.colmap`, `.ply`, `.pcd`, `.las`, `.laz`, `.mcap` or CSV tables.
+    """Write a map as `.tum`, `.kitti`, `.csv` (EuRoC), `.g2o`, `.colmap`, `.ply`, `.pcd`, `.las`, `.laz`, `.mcap`, `.geojson` or CSV tables.
 
     Args:
         map_: The map.
@@ -133,6 +134,11 @@ def _las(map_: Map, folder: Path, path: Path, config: ExportConfig) -> ExportRep
     )
 
 
+def _geojson(map_: Map, folder: Path, path: Path, config: ExportConfig) -> ExportReport:  # noqa: ARG001
+    written = write_geojson(map_, path, in_map_frame=config.crs == "map")
+    return ExportReport(files=(path,), written=written)
+
+
 def _mcap(map_: Map, folder: Path, path: Path, config: ExportConfig) -> ExportReport:  # noqa: ARG001
     """Write poses as Odometry on `/missions/ID/poses`, relative edges on `/edges`, by stamp."""
     is_relative = np.isin(map_.edges.kind, RELATIVE_KINDS) & (map_.edges.vertex_b >= 0)
@@ -190,6 +196,7 @@ EXPORTERS: dict[str, Callable[[Map, Path, Path, ExportConfig], ExportReport]] = 
     ".las": _las,
     ".laz": _las,
     ".mcap": _mcap,
+    ".geojson": _geojson,
     "": _csv_tables,
 }
 KNOWN = ", ".join(filter(None, EXPORTERS)) + ", or a folder for CSV tables"

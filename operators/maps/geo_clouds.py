@@ -9,7 +9,7 @@ import numpy as np
 
 from mapstream.operators.gnss.geodesy import GeodeticPlane
 from mapstream.recordings.maps.model import Map
-from mapstream.streams.arrays import FloatArray
+from mapstream.streams.arrays import FloatArray, IntArray
 from mapstream.streams.errors import MapError
 from mapstream.streams.geometry import invert
 
@@ -37,22 +37,34 @@ def projection_of(map_: Map, crs: str = "utm") -> Projection:
         MapError: If a projection is asked for by code, and the map has no place on Earth.
         ConfigError: If there is no such projection.
     """
-    is_placed = np.isfinite(map_.frames.origin_lla).all(axis=1) & (map_.frames.crs != "")
-    placed = np.flatnonzero(is_placed)
-    if crs == "map" or (crs == "utm" and not len(placed)):
+    to_lla = lla_of(map_)
+    if crs == "map" or (crs == "utm" and to_lla is None):
         return Projection(crs="", wkt="", place=lambda points_map: points_map)
-    if not len(placed):
+    if to_lla is None:
         raise MapError(
             f"a cloud in {crs} needs a map with a place on Earth, and this one never saw a satellite;"
             " write it with crs=map"
         )
-    origin_lla = map_.frames.origin_lla[placed[0]]
-    here = GeodeticPlane.of_frame(map_.frames.crs[placed[0]], origin_lla)
-    wanted = GeodeticPlane.at(crs, origin_lla)
-    T_frame_map = invert(map_.frames.T_map_frame[placed[0]])
+    wanted = GeodeticPlane.at(crs, map_.frames.origin_lla[_placed(map_)[0]])
+    return Projection(
+        crs=wanted.crs,
+        wkt=wanted.wkt(),
+        place=lambda points_map: wanted.coordinates(to_lla(points_map)),
+    )
 
-    def place(points_map: FloatArray) -> FloatArray:
-        in_frame = points_map @ T_frame_map[:3, :3].T + T_frame_map[:3, 3]
-        return wanted.coordinates(here.to_lla(in_frame))
 
-    return Projection(crs=wanted.crs, wkt=wanted.wkt(), place=place)
+def lla_of(map_: Map) -> Callable[[FloatArray], FloatArray] | None:
+    """Return from points (N, 3) of the map frame [m] to latitude, longitude [deg] and height [m]; None without a place."""
+    placed = _placed(map_)
+    if not len(placed):
+        return None
+    frames, row = map_.frames, placed[0]
+    here = GeodeticPlane.of_frame(frames.crs[row], frames.origin_lla[row])
+    T_frame_map = invert(frames.T_map_frame[row])
+    return lambda points_map: here.to_lla(points_map @ T_frame_map[:3, :3].T + T_frame_map[:3, 3])
+
+
+def _placed(map_: Map) -> IntArray:
+    """Return the outer frames (rows) whose place on Earth is known."""
+    frames = map_.frames
+    return np.flatnonzero(np.isfinite(frames.origin_lla).all(axis=1) & (frames.crs != ""))

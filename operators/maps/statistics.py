@@ -47,6 +47,8 @@ class MapStatistics:
     missions: tuple[MissionStatistics, ...]
     edges: tuple[EdgeStatistics, ...]  # by kind, in alphabetical order
     landmarks: dict[str, int]  # by kind
+    objects: dict[str, int]  # landmarks by class
+    regions: dict[str, int]  # by kind
     resources: dict[str, int]  # by kind
     coobservability: IntArray  # (M, M) landmarks that are observed from both missions
 
@@ -64,6 +66,8 @@ def map_statistics(map_: Map) -> MapStatistics:
         missions=tuple(_mission(map_, row) for row in range(len(map_.missions))),
         edges=tuple(_edges(map_, kind) for kind in kinds),
         landmarks=_counts(map_.landmarks.kind.tolist()),
+        objects=_counts([label for label in map_.landmarks.label.tolist() if label]),
+        regions=_counts(map_.regions.kind.tolist()),
         resources=_counts(map_.resources.kind.tolist()),
         coobservability=coobservability(map_),
     )

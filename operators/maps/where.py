@@ -39,10 +39,9 @@ class Thing:
 
 def where(map_: Map, text: str, near: FloatArray | None = None) -> list[Thing]:
     """Return what is called so, those seen most often first; or the nearest first, if a point (3,) is given."""
-    regions = regions_of(map_)
     rows = [row for row in things(map_).tolist() if matches(text, words_of(map_, row))]
-    counts = observation_counts(map_)
-    found = [_landmark(map_, row, regions, counts, near) for row in rows]
+    regions = regions_of(map_)
+    found = described(map_, rows, near)
     found += [
         _region(region, regions, near)
         for region in regions
@@ -51,6 +50,12 @@ def where(map_: Map, text: str, near: FloatArray | None = None) -> list[Thing]:
     if near is not None:
         return sorted(found, key=lambda each: (each.distance_m or 0.0, each.id, each.name))
     return sorted(found, key=lambda each: (-each.num_observations, each.label, each.name, each.id))
+
+
+def described(map_: Map, rows: Sequence[int], near: FloatArray | None = None) -> list[Thing]:
+    """Return what is known of landmarks (rows), in their order; with how far they are from a point (3,)."""
+    regions, counts = regions_of(map_), observation_counts(map_)
+    return [_landmark(map_, row, regions, counts, near) for row in rows]
 
 
 def observation_counts(map_: Map) -> IntArray:

@@ -172,7 +172,7 @@ def test_S6_poses_and_edges_go_into_a_recording(tmp_path: Path) -> None:
 
 
 def test_unknown_formats_are_refused(tmp_path: Path) -> None:
-    known = r"known are \.tum, \.kitti, \.csv, \.g2o, \.colmap, \.ply, \.pcd, \.las, \.laz, \.mcap"
+    known = r"known are \.tum, \.kitti, \.csv, \.g2o, \.colmap, \.ply, \.pcd, \.las, \.laz, \.mcap, \.geojson"
     with pytest.raises(MapError, match=rf"map\.e57: unknown format '\.e57'; {known}"):
         export_map(full_map(), tmp_path, tmp_path / "map.e57", CONFIG)
     with pytest.raises(
@@ -183,7 +183,7 @@ def test_unknown_formats_are_refused(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("suffix", [s for s in EXPORTERS if s not in (".g2o", ".mcap", "")])
 def test_an_empty_map_has_nothing_to_write(suffix: str, tmp_path: Path) -> None:
-    with pytest.raises(MapError, match=r"no poses to write|there are no clouds|has no images"):
+    with pytest.raises(MapError, match=r"no poses to write|no clouds|has no images|no objects"):
         export_map(Map.empty(), tmp_path, tmp_path / f"map{suffix}", CONFIG)
 
     assert not list(tmp_path.iterdir())
@@ -225,6 +225,7 @@ def test_M12_tables_hold_every_number_exactly(tmp_path: Path) -> None:
 
     assert report.written == {
         "missions": 1, "vertices": 6, "edges": 16, "landmarks": 4, "observations": 5, "imu": 15,
+        "objects": 1, "regions": 3,
     }  # fmt: skip
     assert set(report.files) == set((tmp_path / "tables").iterdir())
     vertices = read_csv(tmp_path / "tables" / "vertices.csv")

@@ -95,7 +95,12 @@ def print_statistics(folder: Path, *, json: bool) -> None:
         ("edges", "count", "between missions", "switched off"),
         [(e.kind, e.count, e.num_between_missions, e.num_switched_off) for e in found.edges],
     )
-    for what, counts in (("landmarks", found.landmarks), ("files", found.resources)):
+    for what, counts in (
+        ("landmarks", found.landmarks),
+        ("objects", found.objects),
+        ("regions", found.regions),
+        ("files", found.resources),
+    ):
         if counts:
             say_table((what, "count"), list(counts.items()))
     if found.coobservability.any():
