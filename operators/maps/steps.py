@@ -35,6 +35,7 @@ class Tool(Protocol):
 TOOLS = {
     "anchor_missions": "mapstream.operators.places.anchoring:anchor_missions",
     "calibrate": "mapstream.operators.estimation.vision.calibration:calibrate",
+    "close_semantic_loops": "mapstream.operators.objects.loops.closing:close_semantic_loops",
     "close_visual_loops": "mapstream.operators.places.loops:find_visual_loops",
     "compress_descriptors": "mapstream.operators.maps.descriptor_projections:compress_descriptors",
     "create_landmarks": "mapstream.operators.landmarks.create:create_landmarks",

@@ -39,6 +39,7 @@ VERBS = (
     Verb("remove-invalid-observations", "rio", "Free landmarks of observations that cannot be true."),
     Verb("keyframe", "kfh", "Keep vertices that say something new, and merge the edges between."),
     Verb("sparsify", "lsparsify", "Keep the landmarks that are most useful for localisation."),
+    Verb("close-semantic-loops", "", "Find places whose objects were seen again: edges, and landmarks merged if wanted."),
     Verb("close-visual-loops", "lc", "Find places that cameras saw again: edges, or landmarks merged."),
     Verb("anchor-missions", "aam", "Find where missions lie by what they see of anchored ones."),
     Verb("calibrate", "", "Find places, lenses or clocks of cameras, and tell how sure that is."),
