@@ -61,7 +61,8 @@ class ImageFit:
         if is_rgb != (frame.encoding == "rgb8"):
             channels = channels[::-1]
         (left, top), (width, height) = self.offset_px, self.inner_px
-        if self.inner_px != self.network_px:
-            out[:] = pad
+        rows, columns = slice(top, top + height), slice(left, left + width)
+        out[:, :top] = out[:, rows.stop :] = pad
+        out[:, rows, :left] = out[:, rows, columns.stop :] = pad
         for plane, channel in zip(out, channels, strict=True):
-            plane[top : top + height, left : left + width] = channel
+            plane[rows, columns] = channel

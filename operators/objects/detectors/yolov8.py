@@ -47,10 +47,11 @@ def layout(probe: Probe) -> Layout | None:
 
 def _read(outputs: Outputs, fit: ImageFit, least_score: float, *, ends: _Ends) -> Candidates:
     table = outputs[ends.boxes]
-    whole = finite_rows(table.T)
-    sure = table[4 : 4 + ends.num_classes]
-    chosen = np.flatnonzero(whole & (sure.max(axis=0) >= least_score))
-    rows = table[:, chosen].T
+    best = table[4 : 4 + ends.num_classes].max(axis=0)
+    chosen = np.flatnonzero(~(best < least_score))  # what is no number is chosen, and told of
+    whole = finite_rows(table[:, chosen].T)
+    rows = table[:, chosen[whole]].T
+    sure = rows[:, 4 : 4 + ends.num_classes]
     middle, half = rows[:, :2], rows[:, 2:4] / 2
     masks = None
     if ends.prototypes is not None:
@@ -58,8 +59,8 @@ def _read(outputs: Outputs, fit: ImageFit, least_score: float, *, ends: _Ends) -
         masks = _Prototypes(outputs[ends.prototypes], coefficients, fit, ends.size_px)
     return Candidates(
         boxes_px=fit.boxes(np.hstack([middle - half, middle + half])),
-        scores=sure[:, chosen].max(axis=0),
-        classes=sure[:, chosen].argmax(axis=0),
+        scores=sure.max(axis=1),
+        classes=sure.argmax(axis=1),
         masks=masks,
         num_broken=int(len(whole) - whole.sum()),
     )

@@ -47,9 +47,9 @@ def _read(
     outputs: Outputs, fit: ImageFit, least_score: float, *, name: str, cells: Float32Array
 ) -> Candidates:
     rows = outputs[name]
-    whole = finite_rows(rows)
-    chosen = np.flatnonzero(whole & (rows[:, 4] >= least_score))  # no class is surer than its box
-    rows, cells = rows[chosen], cells[chosen]
+    chosen = np.flatnonzero(~(rows[:, 4] < least_score))  # what is no number is chosen, and told of
+    whole = finite_rows(rows[chosen])
+    rows, cells = rows[chosen[whole]], cells[chosen[whole]]
     classes = rows[:, 5:].argmax(axis=1)
     middle = (rows[:, :2] + cells[:, :2]) * cells[:, 2:]
     half = np.exp(np.minimum(rows[:, 2:4], _LARGEST)) * cells[:, 2:] / 2
