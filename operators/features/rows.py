@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from mapstream.operators.objects.rows import rows_of as objects_of
 from mapstream.streams.arrays import Float32Array
 from mapstream.streams.messages.sensors import CameraFrame
 from mapstream.streams.messages.vision import ImageFeatures
@@ -49,17 +50,19 @@ def rows_of(features: ImageFeatures, rows: npt.NDArray[Any]) -> ImageFeatures:
     for name in _OPTIONAL:
         array = getattr(features, name)
         chosen[name] = None if array is None else array[rows]
+    if features.objects is not None:
+        chosen["objects"] = objects_of(features.objects, rows)
     return replace(features, keypoints_px=features.keypoints_px[rows], **chosen)
 
 
 def appended(first: ImageFeatures, second: ImageFeatures) -> ImageFeatures:
     """Return the first message with the keypoints of the second behind its own.
 
-    What only one of the two knows of its keypoints is left out; a message without keypoints has no say.
+    What only one of the two knows of its keypoints is left out, and objects are; a message without keypoints has no say.
     """
     if len(second) == 0:
         return first
-    joined: dict[str, Any] = {}
+    joined: dict[str, Any] = {"objects": None if len(first) else second.objects}
     for name in ("keypoints_px", "descriptors", *_OPTIONAL):
         a, b = getattr(first, name), getattr(second, name)
         if len(first) == 0:

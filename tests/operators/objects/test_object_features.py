@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from mapstream.operators.features.rows import rows_of
 from mapstream.operators.landmarks.create import create_landmarks
 from mapstream.operators.landmarks.views import POINT_SIGMA_M
 from mapstream.operators.objects.object_features import ObjectFeatures, ObjectFeaturesConfig
@@ -73,6 +74,16 @@ def test_unknown_centres_and_descriptors_stay_unknown() -> None:
     np.testing.assert_array_equal(found.points_m, np.array([[0, 0, 2], [np.nan] * 3]))
     np.testing.assert_allclose(found.point_sigmas_m, POINT_SIGMA_M)
     np.testing.assert_allclose(found.descriptors, np.array([[0.6, 0.8], [0, 0]]))
+
+
+def test_some_keypoints_are_of_some_objects() -> None:
+    found = rows_of(
+        features_of(detections([INSIDE, AT_THE_BORDER], labels=("cup", "book"))), np.array([1])
+    )
+
+    assert found.objects is not None
+    assert found.objects.labels == ("book",)
+    np.testing.assert_allclose(found.keypoints_px, [[56.75, 25]])
 
 
 def test_a_tracked_object_becomes_a_landmark_of_its_class() -> None:
