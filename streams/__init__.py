@@ -23,6 +23,7 @@ from mapstream.streams.messages.estimates import (
     Splice,
     Submap,
 )
+from mapstream.streams.messages.objects import ObjectDetections
 from mapstream.streams.messages.sensors import (
     CameraFrame,
     EncodedImage,
@@ -74,6 +75,7 @@ __all__ = [
     "MappingError",
     "Message",
     "NFrame",
+    "ObjectDetections",
     "Odometry",
     "OrganizedCloud",
     "OuterFrame",

@@ -15,13 +15,22 @@ from mapstream.recordings.decoding import decoder_for
 from mapstream.recordings.diagnosis import diagnose
 from mapstream.recordings.mcap_writer import McapWriter
 from mapstream.recordings.recording import open_recording
-from mapstream.streams import SE3, Constraint, ImageFeatures, LandmarkRef, LoopClosure, Odometry
+from mapstream.streams import (
+    SE3,
+    Constraint,
+    ImageFeatures,
+    LandmarkRef,
+    LoopClosure,
+    ObjectDetections,
+    Odometry,
+)
 from mapstream.streams.messages.sensors import Message
 
-PAGE = Path(__file__).parent.parent / "docs" / "inputs.md"
+DOCS = Path(__file__).parent.parent / "docs"
+TEXT = "".join((DOCS / page).read_text() for page in ("inputs.md", "objects.md"))
 WRITERS = {
     name: body
-    for body in re.findall(r"^```python\n(.*?)^```$", PAGE.read_text(), re.MULTILINE | re.DOTALL)
+    for body in re.findall(r"^```python\n(.*?)^```$", TEXT, re.MULTILINE | re.DOTALL)
     for name in re.findall(r"python write_(\w+)\.py", body)
 }
 KINDS = {
@@ -31,6 +40,7 @@ KINDS = {
     "features": ImageFeatures,
     "tracks": ImageFeatures,
     "points": ImageFeatures,
+    "objects": ObjectDetections,
 }
 TIGHT = np.diag([1e-4] * 6)
 NOWHERE = SE3.identity()
