@@ -91,6 +91,8 @@ BUILT_IN = {
     "rectify": "mapstream.operators.images.rectify:Rectify",
     "resize": "mapstream.operators.images.resize:Resize",
     "rgbd_odometry": "mapstream.operators.odometry.rgbd.rgbd_odometry:RgbdOdometry",
+    "semantic_loops": "mapstream.operators.objects.loops.semantic_loops:SemanticLoops",
+    "static_clouds": "mapstream.operators.objects.static_clouds:StaticClouds",
     "submap_builder": "mapstream.operators.submaps.submap_builder:SubmapBuilder",
     "superpoint": "mapstream.operators.networks.superpoint:SuperPoint",
     "track_filter": "mapstream.operators.tracking.track_filter:TrackFilter",

@@ -10,7 +10,7 @@ from pydantic import Field
 
 from mapstream.operators.landmarks.create import create_landmarks
 from mapstream.operators.landmarks.locating import LocateConfig
-from mapstream.operators.operator import Operator, Placement, offload, warn
+from mapstream.operators.operator import Operator, Placement, offload
 from mapstream.operators.places.loops import (
     SOURCE,
     ComparedPlace,
@@ -21,9 +21,8 @@ from mapstream.operators.places.loops import (
 from mapstream.operators.places.recognition import Found
 from mapstream.operators.places.searching import Search, SearchConfig, landmark_positions
 from mapstream.operators.places.views import VertexViews
-from mapstream.recordings.maps.build import with_poses
+from mapstream.operators.submaps.corrected_map import CorrectedMap
 from mapstream.recordings.maps.model import Map
-from mapstream.recordings.maps.submaps import append_submap
 from mapstream.streams.channel import Receiver, Sender
 from mapstream.streams.geometry import SE3
 from mapstream.streams.messages.estimates import (
@@ -72,47 +71,22 @@ class VisualLoops(Operator[Inputs, Outputs]):
 
     def __init__(self, config: VisualLoopsConfig) -> None:
         self._config = config
-        self._map = Map.empty()
+        self._corrected = CorrectedMap()
         self._search = Search(config)
 
     async def run(self, inputs: Inputs, outputs: Outputs) -> None:
-        newest_ns: dict[str, int] = {}
         async for submap in inputs.submaps:
-            before_ns = newest_ns.get(submap.mission_id)
-            if inputs.corrections is not None and before_ns is not None:
-                await self._hear(inputs.corrections, submap.mission_id, before_ns)
-            newest_ns[submap.mission_id] = submap.stamp_ns
+            await self._corrected.follow(inputs.corrections, submap)
             await outputs.loops.send(await offload(self.search, submap))
-
-    async def _hear(
-        self, corrections: Receiver[MapCorrection], mission_id: str, stamp_ns: int
-    ) -> None:
-        """Wait for the poses that the optimizer had after the submap that ended at this stamp."""
-        async for correction in corrections:
-            self._correct(correction)
-            if correction.mission_id == mission_id and correction.stamp_ns >= stamp_ns:
-                return
-        warn("the optimizer's corrections ended; loops are searched by odometry")
-
-    def _correct(self, correction: MapCorrection) -> None:
-        rows = self._map.vertices_of(self._map.mission_row(correction.mission_id))
-        stamps_ns = self._map.vertices.stamp_ns[rows]
-        at = np.searchsorted(correction.stamps_ns, stamps_ns)
-        is_known = np.append(correction.stamps_ns, -1)[at] == stamps_ns
-        poses = correction.T_mission_base[at[is_known]]
-        self._map = with_poses(self._map, rows[is_known], poses)
 
     def search(self, submap: Submap) -> LoopReport:
         """Look for loops from the new keyframes of one submap."""
-        first = len(self._map.vertices)
-        map_ = append_submap(self._map, replace(submap, constraints=()))
-        map_, _ = create_landmarks(map_, self._config.landmarks)
-        self._map = map_ = _with_open_tracks(map_)
+        new = self._corrected.append(submap)
+        map_, _ = create_landmarks(self._corrected.map, self._config.landmarks)
+        self._corrected.map = map_ = _with_open_tracks(map_)
         views, landmarks_map = VertexViews(map_, self._config.kinds), landmark_positions(map_)
         edges: list[RelativePose] = []
         places: list[ComparedPlace] = []
-        new = np.arange(first, len(map_.vertices))
-        new = new[np.argsort(map_.vertices.stamp_ns[new], kind="stable")]
         for vertex in new[:: self._config.every].tolist():
             compared = self._search.compare(map_, vertex, views, landmarks_map)
             if compared is None:
@@ -127,7 +101,8 @@ class VisualLoops(Operator[Inputs, Outputs]):
         )
 
     def _edge(self, vertex: int, place: Found) -> RelativePose:
-        map_, edge = self._map, loop_edge(self._map, vertex, place, self._config.edge)
+        map_ = self._corrected.map
+        edge = loop_edge(map_, vertex, place, self._config.edge)
         vertices = map_.vertices
         return RelativePose(
             kind="loop",

@@ -128,7 +128,7 @@ class Pairs:
         """Return which pairs (T, M) were seen around the time of all of a triple, in both places."""
         a, b, near = self._a, self._b, self._near
         around_a = near[a[triples]][:, :, a].all(axis=1)
-        around: BoolArray = around_a & near[b[triples]][:, :, b].all(axis=1)
+        around: BoolArray = np.asarray(around_a & near[b[triples]][:, :, b].all(axis=1))
         return around
 
     def _off(self, motions: FloatArray) -> FloatArray:
