@@ -7,7 +7,7 @@ import rerun as rr
 
 from mapstream.graph.views.colors import AXES, ramp_colors
 from mapstream.graph.views.growing import MAP_PATH
-from mapstream.graph.views.objects import class_color, extents
+from mapstream.graph.views.objects import class_colors, extents
 from mapstream.graph.views.planes import PLANE, drawn
 from mapstream.graph.views.scene import Entry
 from mapstream.operators.maps.where import extent_of
@@ -46,13 +46,7 @@ def _marks(map_: Map, rows: IntArray, path: str) -> list[Entry]:
     captions = _captions(map_, rows)
     if any(captions):
         classes = map_.landmarks.label[rows]
-        colors = np.array(
-            [
-                class_color(label) if label else color
-                for label, color in zip(classes, colors, strict=True)
-            ],
-            np.uint32,
-        )
+        colors = np.where(classes == "", colors, class_colors(classes.tolist()))
     marks = rr.Points3D(
         poses[:, :3, 3],
         colors=colors,
@@ -70,7 +64,7 @@ def _sized(map_: Map, rows: IntArray, path: str) -> list[Entry]:
     if not known:
         return []
     sized = np.array([row for row, _ in known])
-    colors = [class_color(label) for label in map_.landmarks.label[sized]]
+    colors = class_colors(map_.landmarks.label[sized].tolist())
     boxes = extents(map_.T_map_landmark(sized), np.array([size for _, size in known]), colors)
     return [Entry.of(f"{path}/extents", boxes)]
 

@@ -36,9 +36,14 @@ def class_color(label: str) -> int:
     return r << 24 | g << 16 | b << 8 | 0xFF
 
 
+def class_colors(labels: Sequence[str]) -> ColorArray:
+    """Return the colours (N,) of classes; of a list of three Rerun would make one."""
+    return np.array([class_color(label) for label in labels], np.uint32)
+
+
 def view_object_detections(detections: ObjectDetections, scene: Scene) -> Drawing:
     """Draw boxes with class, track and score over the image, masks as tints, and what is known of them in space."""
-    colors = np.array([class_color(label) for label in detections.labels], np.uint32)
+    colors = class_colors(detections.labels)
     boxes = _boxes(detections.boxes_px, detections.labels, _captions(detections))
     size_px = detections.width_px, detections.height_px
     masks = [
@@ -72,7 +77,10 @@ def map_detections(map_: Map, sensor: str, vertex: int, scene: Scene) -> list[En
         return []
     labels = seen.label[table.observation[rows]].tolist()
     tracks = seen.track[table.observation[rows]].tolist()
-    captions = [f"{label} {track}" for label, track in zip(labels, tracks, strict=True)]
+    captions = [
+        label if track == NO_TRACK else f"{label} {_number(track)}"
+        for label, track in zip(labels, tracks, strict=True)
+    ]
     masks = [
         (label, *mask_of(map_, row))
         for label, row in zip(labels, rows.tolist(), strict=True)
@@ -85,13 +93,13 @@ def map_detections(map_: Map, sensor: str, vertex: int, scene: Scene) -> list[En
     ]
 
 
-def extents(T: FloatArray, extents_m: FloatArray, colors: Sequence[int]) -> rr.Boxes3D:
+def extents(T: FloatArray, extents_m: FloatArray, colors: ColorArray) -> rr.Boxes3D:
     """Return boxes of these sizes (N, 3) at poses (N, 4, 4)."""
     return rr.Boxes3D(
         centers=T[:, :3, 3],
         half_sizes=extents_m / 2,
         quaternions=quat_xyzw_from_rotation(T[:, :3, :3]),
-        colors=list(colors),
+        colors=colors,
         radii=_LINE,
     )
 
@@ -100,7 +108,7 @@ def _boxes(boxes_px: Float32Array, labels: Sequence[str], captions: Sequence[str
     return rr.Boxes2D(
         array=boxes_px,
         array_format=rr.Box2DFormat.XYXY,
-        colors=[class_color(label) for label in labels],
+        colors=class_colors(labels),
         labels=list(captions),
         draw_order=_BOX_ORDER,
     )
@@ -112,11 +120,16 @@ def _captions(detections: ObjectDetections) -> list[str]:
     for row, label in enumerate(detections.labels):
         words = [label]
         if detections.track_ids is not None and detections.track_ids[row] != NO_TRACK:
-            words.append(f"#{detections.track_ids[row]}")
+            words.append(_number(int(detections.track_ids[row])))
         if detections.texts and detections.texts[row]:
             words.append(f'"{detections.texts[row]}"')
         captions.append(" ".join([*words, f"{detections.scores[row]:.2f}"]))
     return captions
+
+
+def _number(track: int) -> str:
+    """Return the last digits of a track's number: they tell it from those that one sees beside it."""
+    return f"#{track % 10_000}"
 
 
 def _tints(

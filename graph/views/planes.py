@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 import rerun as rr
 
+from mapstream.graph.views.colors import ColorArray
 from mapstream.graph.views.scene import BASE, Drawing, Entry, Scene
 from mapstream.recordings.maps.hulls import hull_of
 from mapstream.streams.arrays import FloatArray
@@ -21,7 +22,7 @@ _NORMAL_M = 0.2
 
 def view_plane_segments(planes: PlaneSegments, scene: Scene) -> Drawing:
     """Draw what is seen around the robot: outlines, surfaces and normals; plot how many there are."""
-    colors = [_SEEN[row % len(_SEEN)] for row in range(len(planes))]
+    colors = np.array([_SEEN[row % len(_SEEN)] for row in range(len(planes))], np.uint32)
     boundaries, surface = drawn(planes.T_base_plane, planes.hulls_m, colors)
     normals = rr.Arrows3D(
         origins=planes.T_base_plane[:, :3, 3],
@@ -49,7 +50,7 @@ def view_plane_constraint(constraint: Constraint, scene: Scene) -> Drawing:
 def drawn(
     T: FloatArray,
     hulls_m: Sequence[FloatArray],
-    colors: Sequence[int],
+    colors: ColorArray | Sequence[int],
     labels: Sequence[str] = (),
 ) -> tuple[rr.LineStrips3D, rr.Mesh3D]:
     """Return the outlines of planes and their surfaces, which are convex; a line has no surface.
@@ -61,7 +62,7 @@ def drawn(
         labels: N, or none.
     """
     strips, triangles, shades, first = [], [], [], 0
-    for pose, hull, color in zip(T, hulls_m, colors, strict=True):
+    for pose, hull, color in zip(T, hulls_m, map(int, colors), strict=True):
         corners = hull @ pose[:3, :2].T + pose[:3, 3]
         strips.append(np.concatenate([corners, corners[:1]]).astype(np.float32))
         fan = np.arange(1, max(len(corners) - 1, 1))
@@ -76,7 +77,7 @@ def drawn(
     )
     boundaries = rr.LineStrips3D(
         strips,
-        colors=list(colors),
+        colors=np.array(colors, np.uint32),  # of a list of three Rerun would make one
         radii=rr.Radius.ui_points(1.5),
         labels=list(labels) if any(labels) else None,
     )

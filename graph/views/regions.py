@@ -29,7 +29,8 @@ def region_entries(map_: Map) -> list[Entry]:
         colors += [mission_color(number)] * len(lines)
     drawing = []
     if strips:
-        outlines = rr.LineStrips3D(strips, colors=colors, radii=_LINE, labels=labels)
+        shades = np.array(colors, np.uint32)
+        outlines = rr.LineStrips3D(strips, colors=shades, radii=_LINE, labels=labels)
         drawing.append(Entry.of(f"{MAP_PATH}/regions", outlines))
     if places:
         marks = rr.Points3D(

@@ -105,5 +105,5 @@ def test_detections_of_a_map_lie_over_its_pictures(tmp_path: Path) -> None:
 
     entities = shown(map_, tmp_path)
 
-    assert values_of(entities[f"{ROBOT}/cam0/objects"], "Boxes2D:labels") == [["cup 0"]]
+    assert values_of(entities[f"{ROBOT}/cam0/objects"], "Boxes2D:labels") == [["cup #0"]]
     assert len(values_of(entities[f"{ROBOT}/cam0/masks"], "SegmentationImage:buffer")) == 1

@@ -47,6 +47,24 @@ def test_P1_planes_and_wall_lines_are_drawn_within_their_outlines(tmp_path: Path
     assert np.ravel(counts).tolist() == [2.0, 0.0]
 
 
+def test_three_planes_have_three_colours(tmp_path: Path) -> None:
+    """Rerun takes a list of three numbers for red, green and blue."""
+    planes = PlaneSegments(
+        stamp_ns=1,
+        T_base_plane=np.tile(WALL.matrix, (3, 1, 1)),
+        covariances=np.tile(np.eye(6), (3, 1, 1)),
+        hulls_m=(SQUARE,) * 3,
+        num_points=np.full(3, 10),
+        rmse_m=np.zeros(3),
+    )
+
+    entities = drawn(tmp_path, [planes])
+
+    for path in ("/op/port", "/op/port/normals"):
+        kind = "LineStrips3D" if path == "/op/port" else "Arrows3D"
+        assert len(set(values_of(entities[path], f"{kind}:colors")[0])) == 3
+
+
 def test_P1_a_plane_that_was_recognised_is_drawn_with_its_name(tmp_path: Path) -> None:
     seen = Constraint(
         stamp_ns=1,
