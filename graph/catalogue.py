@@ -75,6 +75,7 @@ BUILT_IN = {
     "mesh_sink": "mapstream.operators.sinks.mesh:MeshSink",
     "n_frames": "mapstream.operators.tracking.n_frames:NFrames",
     "network_tracker": "mapstream.operators.networks.network_tracker:NetworkTracker",
+    "object_descriptors": "mapstream.operators.objects.object_descriptors:ObjectDescriptors",
     "object_detector": "mapstream.operators.objects.object_detector:ObjectDetector",
     "object_features": "mapstream.operators.objects.object_features:ObjectFeatures",
     "object_masks": "mapstream.operators.objects.masks.object_masks:ObjectMasks",

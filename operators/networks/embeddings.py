@@ -22,6 +22,7 @@ from mapstream.streams.arrays import Float32Array
 from mapstream.streams.errors import ConfigError, OperatorError
 
 RgbImage = npt.NDArray[np.uint8]
+_MAP_PX = 16  # between the cells of the map; the sides of the image are multiples of CELL_PX
 
 
 class Embedding(Protocol):
@@ -65,6 +66,11 @@ class MobileNetCells:
         maps = self._session.run({"image": _planes(image, size_px)})["s16"]
         cells: Float32Array = maps.reshape(CHANNELS_AT_16, -1).T
         return cells
+
+    def grid(self, image: RgbImage) -> tuple[int, int]:
+        """Return how many cells an image (H, W, 3) has beside each other, and how many rows of them."""
+        width_px, height_px = _sides_px(image, self._long_side_px)
+        return width_px // _MAP_PX, height_px // _MAP_PX
 
 
 class FileEmbedding:

@@ -1,7 +1,8 @@
 """A picture as one vector: what its cells are like beyond the words of a vocabulary, summed.
 
 Sources: Jegou et al., Aggregating local descriptors into a compact image representation, CVPR 2010;
-Arandjelovic et al., NetVLAD, CVPR 2016, equation 1, for the soft assignment.
+Arandjelovic et al., NetVLAD, CVPR 2016, equation 1, for the soft assignment;
+Perronnin et al., Improving the Fisher kernel, ECCV 2010, section 3.2, for the roots.
 """
 
 from __future__ import annotations
@@ -37,12 +38,40 @@ class Vocabulary:
     def vector(self, cells: Float32Array) -> Float32Array:
         """Return the vector (K D,) of unit length of cells (N, C); all zeros if they say nothing."""
         points = self.points(cells)
-        logits = np.float32(_SHARPNESS) * (2 * points @ self.words.T - (self.words**2).sum(axis=1))
-        shares = np.exp(logits - logits.max(axis=1, keepdims=True))
-        shares /= shares.sum(axis=1, keepdims=True)
-        beyond = shares.T @ points - shares.sum(axis=0)[:, None] * self.words
-        vector: Float32Array = _unit(_unit(beyond.astype(np.float32)).reshape(1, -1))[0]
+        beyond = self._beyond(points, self._shares(points))
+        vector: Float32Array = _unit(_unit(beyond).reshape(1, -1))[0]
         return vector
+
+    def vectors(self, cells: Float32Array, weights: Float32Array) -> Float32Array:
+        """Return the vectors (M, K D) of parts of an image, of unit length; all zeros where a part says nothing.
+
+        In the vector of an image all words count the same. A part has few cells, and words that none of them is
+        near would be noise; so its numbers become their roots instead, which keep their signs.
+
+        Args:
+            cells: (N, C).
+            weights: (M, N) how much of each cell belongs to each part, from 0 to 1.
+        """
+        points = self.points(cells)
+        shares = self._shares(points)
+        vectors = np.empty((len(weights), self.width), np.float32)
+        for row, weight in enumerate(weights):
+            own = np.flatnonzero(weight)
+            vectors[row] = self._beyond(points[own], weight[own, None] * shares[own]).reshape(-1)
+        return _unit(np.sign(vectors) * np.sqrt(np.abs(vectors)))
+
+    def _shares(self, points: Float32Array) -> Float32Array:
+        """Return how much each point (N, D) belongs to each word (N, K)."""
+        logits = np.float32(_SHARPNESS) * (2 * points @ self.words.T - (self.words**2).sum(axis=1))
+        shares: Float32Array = np.exp(logits - logits.max(axis=1, keepdims=True))
+        shares /= shares.sum(axis=1, keepdims=True)
+        return shares
+
+    def _beyond(self, points: Float32Array, shares: Float32Array) -> Float32Array:
+        """Return the sum of what points (N, D) are beyond each word (K, D)."""
+        beyond = shares.T @ points - shares.sum(axis=0)[:, None] * self.words
+        sums: Float32Array = beyond.astype(np.float32)
+        return sums
 
     def points(self, cells: Float32Array) -> Float32Array:
         """Return cells (N, C) whitened, shortened and of unit length (N, D)."""
