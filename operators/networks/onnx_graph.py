@@ -22,7 +22,7 @@ Attribute = int | float | str | Sequence[int]
 _OPERATOR_SET = 17
 _IR_VERSION = 8
 _PRODUCER = b"mapstream"
-_ELEMENT_TYPES = {"float32": 1, "uint8": 2, "int32": 6, "int64": 7, "bool": 9}
+_ELEMENT_TYPES = {"float32": 1, "uint8": 2, "int32": 6, "int64": 7, "bool": 9, "float16": 10}
 _VARINT, _BYTES, _FLOAT = 0, 2, 5  # wire types of protocol buffers
 
 

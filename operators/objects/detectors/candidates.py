@@ -23,11 +23,9 @@ class MaskSource(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Candidates:
-    """N boxes of an image."""
+    """N boxes of an image, in which the middle of the first pixel is (0, 0)."""
 
-    boxes_px: (
-        Float32Array  # (N, 4) x_min, y_min, x_max, y_max; the middle of the first pixel is (0, 0)
-    )
+    boxes_px: Float32Array  # (N, 4) x_min, y_min, x_max, y_max
     scores: Float32Array  # (N,)
     classes: IntArray  # (N,)
     masks: MaskSource | None = None

@@ -29,7 +29,7 @@ def layout(probe: Probe) -> Layout | None:
     if tuple(grid[::-1]) != tuple(side // _STRIDE_PX for side in probe.size_px) or width < 6:
         return None
     read = partial(_read, name=names[0], size_px=probe.size_px)
-    return Layout("fastestdet", read, num_classes=width - 5, fit="stretch", is_rgb=False)
+    return Layout(read, num_classes=width - 5, fit="stretch", is_rgb=False)
 
 
 def _read(

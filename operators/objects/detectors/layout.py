@@ -21,7 +21,6 @@ Read = Callable[[Outputs, ImageFit, float], Candidates]
 class Layout:
     """How to feed a network, and how to read it."""
 
-    name: str
     read: Read
     num_classes: int | None = None  # None: the outputs do not tell
     fit: FitMode = "corner"
@@ -37,7 +36,6 @@ class Probe:
 
     outputs: Outputs  # with their batch, if they have one
     size_px: tuple[int, int]  # width and height of the image
-    metadata: Mapping[str, str]
 
     def of_rank(self, rank: int) -> list[str]:
         """Return the outputs with so many axes."""

@@ -44,7 +44,7 @@ def layout(probe: Probe) -> Layout | None:
         return None
     names = _Names(boxes, labels, scores, masks)
     read = partial(_read, names=names)
-    return Layout("mask_rcnn", read, pad=0.0, keeps_size=True)
+    return Layout(read, pad=0.0, keeps_size=True)
 
 
 def _output(outputs: Outputs, part: str) -> str | None:

@@ -109,7 +109,8 @@ class DetectorNetwork:
 
     def _run(self, planes: Float32Array) -> Outputs:
         given = planes if len(self._shape) == 4 else planes[0]
-        return self._session.run({self._input: given})
+        found = self._session.run({self._input: given})
+        return {n: a.astype(np.float32) if a.dtype == np.float16 else a for n, a in found.items()}
 
     def _told(self, wanted: LayoutName) -> Layout:
         """Return the layout of the network, by what it gives for an empty image."""
@@ -119,7 +120,7 @@ class DetectorNetwork:
             outputs = self._run(np.zeros((batch, _CHANNELS, height, width), np.float32))
         except OperatorError as error:
             raise ConfigError(f"no detector of images: {error}") from error
-        probe = Probe(outputs, self._size_px, self._session.metadata)
+        probe = Probe(outputs, self._size_px)
         names = [wanted] if wanted != "auto" else list(_ADAPTERS)
         found = [layout for name in names if (layout := _ADAPTERS[name].layout(probe)) is not None]
         if not found:

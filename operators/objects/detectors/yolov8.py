@@ -42,7 +42,7 @@ def layout(probe: Probe) -> Layout | None:
         return None
     ends = _Ends(boxes[0], prototypes[0] if prototypes else None, num_classes, probe.size_px)
     read = partial(_read, ends=ends)
-    return Layout("yolov8", read, num_classes=num_classes, fit="middle")
+    return Layout(read, num_classes=num_classes, fit="middle")
 
 
 def _read(outputs: Outputs, fit: ImageFit, least_score: float, *, ends: _Ends) -> Candidates:
@@ -77,7 +77,8 @@ class _Prototypes:
 
     def mask(self, row: int, box_px: Float32Array, size_px: tuple[int, int]) -> BoolArray:
         """Return where the sum is positive, which is where its sigmoid is over a half."""
-        sums = np.tensordot(self.coefficients[row], self.prototypes, axes=1).astype(np.float32)
+        # not as a product of matrices, for which numpy would start threads of its own
+        sums = np.einsum("m,mhw->hw", self.coefficients[row], self.prototypes)
         cells: FloatArray = np.array(sums.shape[::-1]) / self.size_px  # per pixel of the network
         offset = np.array(self.fit.offset_px) * cells
         is_inside: BoolArray = sampled(sums, self.fit.scale * cells, offset, box_px, size_px) > 0

@@ -31,7 +31,7 @@ def layout(probe: Probe) -> Layout | None:
     if cells is None or width < 6:
         return None
     read = partial(_read, name=names[0], cells=cells)
-    return Layout("yolox", read, num_classes=width - 5, is_rgb=False, most=255.0)
+    return Layout(read, num_classes=width - 5, is_rgb=False, most=255.0)
 
 
 def _cells(size_px: tuple[int, int], strides_px: tuple[int, ...]) -> Float32Array:

@@ -19,10 +19,11 @@ def detector_file(
     outputs: Mapping[str, npt.NDArray[np.generic]],
     image: Sequence[int | str],
     metadata: Mapping[str, str] | None = None,
+    dtype: npt.DTypeLike = np.float32,
 ) -> Path:
-    """Write a network that gives the same for every image."""
+    """Write a network that gives the same for every image, which it takes as numbers of a type."""
     graph = Graph("detector")
-    graph.input("images", np.float32, image)
+    graph.input("images", dtype, image)
     for name, value in outputs.items():
         graph.output(name, graph.add("Identity", value), value.dtype, value.shape)
     for key, text in (metadata or {}).items():

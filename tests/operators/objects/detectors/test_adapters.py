@@ -53,6 +53,20 @@ def test_J1_yolox_boxes_are_where_their_cells_say(tmp_path: Path) -> None:
     assert found.masks == ()
 
 
+def test_networks_of_half_precision_are_read(tmp_path: Path) -> None:
+    rows = yolox_rows()
+    rows[41] = [0.0, 0.5, 0.0, 0.0, 0.9, 0.0, 1.0, 0.0]
+    outputs = {"output": rows[None].astype(np.float16)}
+    names = {"names": "['a', 'b', 'c']"}
+    file = detector_file(tmp_path, outputs, [1, 3, 32, 64], names, np.float16)
+
+    found = find(file, (64, 32))
+
+    assert found.labels == ("b",)
+    np.testing.assert_allclose(found.boxes_px, [[15.5, -0.5, 47.5, 31.5]], atol=1e-3)
+    np.testing.assert_allclose(found.scores, [0.9], atol=1e-3)
+
+
 def test_boxes_end_with_the_image_and_not_with_the_grey_beside_it(tmp_path: Path) -> None:
     rows = yolox_rows()
     rows[41] = [0.0, 0.5, np.log(4), np.log(4), 0.9, 1.0, 0.0, 0.0]
