@@ -12,6 +12,7 @@ import numpy as np
 from pydantic import Field
 
 from mapstream.operators.objects.detectors.class_tables import read_names
+from mapstream.operators.objects.empty_masks import without_empty_masks
 from mapstream.operators.objects.rows import rows_of
 from mapstream.operators.operator import (
     Operator,
@@ -64,9 +65,11 @@ class ExternalDetections(Operator[Inputs, Outputs]):
 
     def __init__(self, config: ExternalDetectionsConfig) -> None:
         self._config = config
-        self._names = read_names(config.class_names) if config.class_names else ()
+        self._names: tuple[str, ...] = ()
 
     async def run(self, inputs: Inputs, outputs: Outputs) -> None:
+        if self._config.class_names is not None:
+            self._names = read_names(self._config.class_names)
         async for detections in inputs.detections:
             faults = detection_faults(detections)
             for fault in faults:
@@ -88,7 +91,7 @@ class ExternalDetections(Operator[Inputs, Outputs]):
         is_used &= whole.scores >= config.min_score
         if config.classes:
             is_used &= np.isin(whole.labels, config.classes)
-        return _with_pixels(rows_of(whole, is_used))
+        return without_empty_masks(rows_of(whole, is_used))
 
     def _named(self, detections: ObjectDetections) -> ObjectDetections:
         """Return the objects with names in the place of numbers."""
@@ -101,8 +104,8 @@ class ExternalDetections(Operator[Inputs, Outputs]):
             return label
         if int(label) < len(self._names):
             return self._names[int(label)]
-        report_loss(f"objects of class {label}, which is not among the {len(self._names)} names")
-        return ""
+        warn(f"objects of class {label}, which is not among the {len(self._names)} names")
+        return label
 
 
 def _seen(detections: ObjectDetections) -> ObjectDetections:
@@ -145,23 +148,3 @@ def _projected(detections: ObjectDetections, row: int, camera: CameraCalibration
     if not has_pixel.any():
         return np.full(4, np.nan)
     return np.concatenate([px[has_pixel].min(axis=0), px[has_pixel].max(axis=0)])
-
-
-def _with_pixels(detections: ObjectDetections) -> ObjectDetections:
-    """Return the objects, those whose mask has no pixel with their box in its place."""
-    empty = [not mask.any() for mask in detections.masks]
-    if not any(empty):
-        return detections
-    for _ in range(sum(empty)):
-        warn(f"masks of {detections.frame} without a pixel; the box takes their place")
-    sources = detections.mask_sources or ("model",) * len(empty)
-    return replace(
-        detections,
-        masks=tuple(
-            np.ones_like(mask) if is_empty else mask
-            for mask, is_empty in zip(detections.masks, empty, strict=True)
-        ),
-        mask_sources=tuple(
-            "box" if is_empty else source for source, is_empty in zip(sources, empty, strict=True)
-        ),
-    )

@@ -17,6 +17,7 @@ from mapstream.operators.images.frame_filter import COLORS, require_encoding
 from mapstream.operators.objects.detectors.candidates import Candidates
 from mapstream.operators.objects.detectors.network import DetectorNetwork, LayoutName
 from mapstream.operators.objects.detectors.suppression import distinct
+from mapstream.operators.objects.empty_masks import without_empty_masks
 from mapstream.operators.operator import (
     DynamicPorts,
     Operator,
@@ -29,7 +30,7 @@ from mapstream.operators.operator import (
     warn,
 )
 from mapstream.operators.period import Period
-from mapstream.streams.arrays import BoolArray, FloatArray, IntArray
+from mapstream.streams.arrays import FloatArray, IntArray
 from mapstream.streams.channel import Sender
 from mapstream.streams.errors import ConfigError, OperatorError
 from mapstream.streams.messages.objects import ObjectDetections
@@ -142,13 +143,8 @@ class ObjectFinder:
             report_loss(f"objects of {frame.frame} whose numbers are not finite")
         size_px = frame.image.shape[1], frame.image.shape[0]
         rows = self._best(frame, found)
-        masks = (
-            [found.masks.mask(row, found.boxes_px[row], size_px) for row in rows]
-            if found.masks
-            else []
-        )
-        sources = ["model" if mask.any() else "box" for mask in masks]
-        return ObjectDetections(
+        masks = found.masks_of(rows, size_px)
+        chosen = ObjectDetections(
             stamp_ns=frame.stamp_ns,
             frame=frame.frame,
             width_px=size_px[0],
@@ -156,12 +152,13 @@ class ObjectFinder:
             boxes_px=found.boxes_px[rows],
             labels=tuple(self._network.classes[number] for number in found.classes[rows]),
             scores=np.minimum(found.scores[rows], 1.0),
-            masks=tuple(map(self._mask_or_box, masks)),
-            mask_sources=tuple(sources),
+            masks=masks,
+            mask_sources=("model",) * len(masks),
             T_base_sensor=frame.T_base_sensor,
             camera=frame.camera,
             record=frame.record,
         )
+        return without_empty_masks(chosen)
 
     def _best(self, frame: CameraFrame, found: Candidates) -> IntArray:
         """Return the rows of what is wanted, the best first."""
@@ -171,10 +168,8 @@ class ObjectFinder:
                 f"{self._config.model}: found a thing of class {classes.max()}, but there are names for"
                 f" {len(self._least)}; give a text file with one a line as `class_names`"
             )
-        is_wanted = (found.scores >= self._least[classes]) & (boxes[:, 2:] > boxes[:, :2]).all(
-            axis=1
-        )
-        wanted = np.flatnonzero(is_wanted)
+        has_area = (boxes[:, 2:] > boxes[:, :2]).all(axis=1)
+        wanted = np.flatnonzero(has_area & (found.scores >= self._least[classes]))
         config = self._config
         distinct_rows = distinct(
             boxes[wanted],
@@ -188,12 +183,6 @@ class ObjectFinder:
         for _ in rows[most:]:
             warn(f"objects of {frame.frame} beyond the best {most} of an image (max_detections)")
         return rows[:most]
-
-    def _mask_or_box(self, mask: BoolArray) -> BoolArray:
-        if mask.any():
-            return mask
-        warn("masks of the network without a pixel; the box takes their place")
-        return np.ones_like(mask)
 
     def _least_scores(self) -> FloatArray:
         """Return the least score for each class, infinite for those that are not wanted."""

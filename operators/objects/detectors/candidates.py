@@ -31,6 +31,12 @@ class Candidates:
     masks: MaskSource | None = None
     num_broken: int = 0  # with numbers that are not finite, left out
 
+    def masks_of(self, rows: IntArray, size_px: tuple[int, int]) -> tuple[BoolArray, ...]:
+        """Return the masks of some, or none at all where the network makes none."""
+        if self.masks is None:
+            return ()
+        return tuple(self.masks.mask(row, self.boxes_px[row], size_px) for row in rows.tolist())
+
 
 def sampled(
     grid: Float32Array,

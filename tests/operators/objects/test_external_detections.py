@@ -131,8 +131,8 @@ async def test_numbers_become_names(tmp_path: Path) -> None:
     (found,) = await let_in(message, context, class_names=names)
     (cups,) = await let_in(message, class_names=names, classes=("cup",))
 
-    assert found.labels == ("cup", "person", "chair")
-    assert "objects of class 2, which is not among the 2 names" in context.activity.losses
+    assert found.labels == ("cup", "person", "chair", "2")
+    assert list(context.activity.warnings) == ["objects of class 2, which is not among the 2 names"]
     assert cups.labels == ("cup",)
     with pytest.raises(ConfigError, match=r"none\.txt: expected names of classes"):
         await let_in(message, class_names=tmp_path / "none.txt")

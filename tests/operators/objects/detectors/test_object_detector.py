@@ -176,7 +176,7 @@ async def test_empty_masks_are_counted(tmp_path: Path) -> None:
     assert found.mask_sources == ("box",)
     assert found.masks[0].all()
     assert list(context.activity.warnings) == [
-        "masks of the network without a pixel; the box takes their place"
+        "masks of left without a pixel; the box takes their place"
     ]
 
 
