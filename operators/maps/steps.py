@@ -48,6 +48,7 @@ TOOLS = {
     "register": "mapstream.operators.lidar.constraints.register:register",
     "remove_bad_landmarks": "mapstream.operators.landmarks.removal:remove_bad_landmarks",
     "remove_invalid_observations": "mapstream.operators.landmarks.removal:remove_invalid_observations",
+    "represent_objects": "mapstream.operators.objects.represent:represent_objects",
     "reset_quality": "mapstream.operators.landmarks.quality:reset_quality",
     "retriangulate": "mapstream.operators.landmarks.create:retriangulate",
     "summarize": "mapstream.operators.places.summary:summarize",

@@ -45,6 +45,7 @@ VERBS = (
     Verb("calibrate", "", "Find places, lenses or clocks of cameras, and tell how sure that is."),
     Verb("compress-descriptors", "", "Keep fewer numbers of each descriptor of a kind, by principal components."),
     Verb("train-projection", "train_projection_matrix", "Learn how an index projects descriptors of a kind."),
+    Verb("represent-objects", "", "Choose the few descriptors that stand for all of an object."),
 )  # fmt: skip
 
 

@@ -26,11 +26,11 @@ class TrackRules(OperatorConfig):
     """So many images in a row must show an object before its track counts."""
     max_age_s: PositiveFloat = 1.5
     """A track that was not seen for longer ends."""
-    max_appearance: PositiveFloat = 0.3
-    """Cosine distance of a detection from the most alike that its track ever looked."""
+    max_appearance: PositiveFloat = 0.55
+    """Cosine distance of a detection from the most alike that its track ever looked; as fits `object_descriptors`."""
     classes: dict[str, ClassRules] = Field(default_factory=dict)
     """What is different for some classes, by their names."""
-    motion_weight: float = Field(default=0.0, ge=0.0, le=1.0)
+    motion_weight: float = Field(default=0.3, ge=0.0, le=1.0)
     """How much the place counts in the choice among detections that are possible; the rest is appearance."""
     gate: PositiveFloat = 9.4877
     """Squared Mahalanobis distance within which a detection is possible; by default 95 % of true ones are."""
