@@ -8,8 +8,9 @@ from mapstream.streams.arrays import BoolArray, Float32Array, FloatArray, IntArr
 
 _STEP_M = 0.02  # between neighbours on one surface
 _STEP_SHARE = 0.02  # the same, of their depth
-_RIVAL = 0.5  # of the weight of the heaviest piece; a nearer one with as much is the object
+_RIVAL = 0.6  # of the weight of the heaviest piece; a nearer one with as much is the object
 _SLACK = 0.25  # of its size: so far before or behind it other pieces are of the object, too
+_MAX_LINKED = 800  # points of a cloud
 _SPECK = 0.02  # of the weight of the object; smaller pieces are noise
 
 
@@ -32,15 +33,22 @@ def pieces_of_depth(depth_m: Float32Array) -> IntArray:
 
 
 def pieces_of_points(points: FloatArray, reach_m: FloatArray) -> IntArray:
-    """Return the number (N,) of the piece that each point (N, 3) is of, from 1; points in reach are of one."""
+    """Return the number (N,) of the piece that each point (N, 3) is of, from 1; points in reach (N,) are of one.
+
+    Of many points some that are evenly spread over their order are linked; the others follow the nearest of these.
+    """
     from scipy.spatial import cKDTree  # noqa: PLC0415  # takes long to import
 
     if not len(points):
         return np.zeros(0, np.int64)
-    pairs = cKDTree(points).query_pairs(float(reach_m.max()), output_type="ndarray")
-    apart_m = np.linalg.norm(points[pairs[:, 0]] - points[pairs[:, 1]], axis=1)
+    few = np.linspace(0, len(points) - 1, min(len(points), _MAX_LINKED)).round().astype(np.int64)
+    tree, reach_m = cKDTree(points[few]), reach_m[few]
+    pairs = tree.query_pairs(float(reach_m.max()), output_type="ndarray")
+    apart_m = np.linalg.norm(points[few[pairs[:, 0]]] - points[few[pairs[:, 1]]], axis=1)
     is_near = apart_m <= np.minimum(reach_m[pairs[:, 0]], reach_m[pairs[:, 1]])
-    return _connected(pairs[is_near], len(points)) + 1
+    labels = _connected(pairs[is_near], len(few)) + 1
+    nearest: IntArray = tree.query(points)[1]
+    return labels[nearest]
 
 
 def dominant(

@@ -7,7 +7,7 @@ import numpy as np
 
 from mapstream.operators.objects.masks.clusters import dominant, pieces_of_depth
 from mapstream.operators.objects.masks.segment import Segment, network_mask
-from mapstream.operators.objects.masks.surround import behind_surround
+from mapstream.operators.objects.masks.surround import on_surround
 from mapstream.streams.arrays import BoolArray, Float32Array, FloatArray
 from mapstream.streams.messages.objects import ObjectDetections, window
 from mapstream.streams.structured_light import depth_sigma_m
@@ -47,8 +47,8 @@ def depth_segment(
         return None
     points = (own_rays * z[..., None]).astype(np.float64)
     least = _MIN_LEFT if given is None else _MIN_LEFT_OF_MASK
-    before = _before_surround(detections, row, depth_m, rays, points, known)
-    known = before if before.sum() >= least * known.sum() else known
+    off = _off_surround(detections, row, depth_m, rays, points, known)
+    known = off if off.sum() >= least * known.sum() else known
     pieces = pieces_of_depth(np.where(known, z, np.float32(np.nan)))
     weights = np.ones(z.shape) if given is not None else _weights(z.shape)
     size_m = float(np.abs(own_rays[0, 0] - own_rays[-1, -1]).max())
@@ -61,7 +61,7 @@ def depth_segment(
     return Segment(mask, points[is_object], "model")
 
 
-def _before_surround(
+def _off_surround(
     detections: ObjectDetections,
     row: int,
     depth_m: Float32Array,
@@ -69,7 +69,7 @@ def _before_surround(
     points: FloatArray,
     known: BoolArray,
 ) -> BoolArray:
-    """Return which of the known points (h, w) are in front of the planes around the box."""
+    """Return which of the known points (h, w) are not on the planes around the box."""
     box = detections.boxes_px[row]
     reach = _AROUND * np.tile(box[2:] - box[:2], 2) * [-1, -1, 1, 1]
     rows, columns = window(box + reach, detections.width_px, detections.height_px)
@@ -83,7 +83,7 @@ def _before_surround(
     around = (rays[y, x] * depth_m[y, x, None]).astype(np.float64)
     margin_m = np.maximum(_NOISE * depth_sigma_m(points[known][:, 2]), _LEAST_MARGIN_M)
     left = known.copy()
-    left[known] = ~behind_surround(points[known], around, margin_m)
+    left[known] = ~on_surround(points[known], around, margin_m)
     return left
 
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from mapstream.operators.objects.masks.clusters import dominant, pieces_of_points
 from mapstream.operators.objects.masks.segment import Segment, network_mask
-from mapstream.operators.objects.masks.surround import behind_surround
+from mapstream.operators.objects.masks.surround import on_surround
 from mapstream.streams.arrays import BoolArray, FloatArray
 from mapstream.streams.calibration import CameraCalibration
 from mapstream.streams.camera_models import project
@@ -57,9 +57,9 @@ def lidar_segment(detections: ObjectDetections, row: int, seen: SeenPoints) -> S
     near = ((seen.px >= box[:2] - _AROUND * sides) & (seen.px <= box[2:] + _AROUND * sides)).all(axis=1)  # fmt: skip
     points, px = seen.points[chosen], seen.px[chosen]
     margin_m = np.full(len(points), _GROUND_M)
-    is_behind = behind_surround(points, seen.points[near & ~inside], margin_m)
-    if (~is_behind).mean() >= _MIN_LEFT and (~is_behind).sum() >= _MIN_POINTS:
-        points, px = points[~is_behind], px[~is_behind]
+    is_on = on_surround(points, seen.points[near & ~inside], margin_m)
+    if (~is_on).mean() >= _MIN_LEFT and (~is_on).sum() >= _MIN_POINTS:
+        points, px = points[~is_on], px[~is_on]
     pieces = pieces_of_points(points, _REACH_M + _REACH_SHARE * points[:, 2])
     off = np.abs(2 * (px - box[:2]) / sides - 1)
     size_m = float((sides / _focal_px(detections)).max())

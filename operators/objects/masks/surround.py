@@ -1,4 +1,4 @@
-"""Planes around a box that go on behind or below the object in it: floor, table, wall."""
+"""Planes around a box that go on in it: floor, table, wall."""
 
 from __future__ import annotations
 
@@ -8,49 +8,54 @@ from mapstream.streams.arrays import BoolArray, FloatArray
 
 _MAX_POINTS = 400
 _NUM_TRIES = 100
-_MIN_SHARE = 0.3  # of what is around, that a plane must hold
-_MAX_PLANES = 2
+_MIN_SHARE = 0.25  # of what is around and on no plane yet, that a plane must hold
+_MAX_PLANES = 3
 _MIN_POINTS = 20
 
 
-def behind_surround(points: FloatArray, around: FloatArray, margin_m: FloatArray) -> BoolArray:
-    """Return which points (N, 3) lie on planes of what is around the box (M, 3), or behind them.
+def on_surround(points: FloatArray, around: FloatArray, margin_m: FloatArray) -> BoolArray:
+    """Return which points (N, 3) lie on planes that go through what is around the box (M, 3).
+
+    What is behind such a plane stays: a table ends, and shows what stands beyond it.
 
     Args:
-        points: In the camera frame [m], whose origin is in front of any plane that it sees.
+        points: In the camera frame [m].
         around: The same, of the surroundings.
-        margin_m: Shape (N,), so far before a plane a point is still on it.
+        margin_m: Shape (N,), so far from a plane a point is still on it.
     """
-    is_behind = np.zeros(len(points), np.bool_)
+    is_on = np.zeros(len(points), np.bool_)
+    if not len(points):
+        return is_on
     rows = np.linspace(0, len(around) - 1, min(len(around), _MAX_POINTS)).round().astype(np.int64)
-    left = around[rows]
-    needed = max(_MIN_POINTS, _MIN_SHARE * len(left))
+    left, usual_m = around[rows], float(np.median(margin_m))
     rng = np.random.default_rng(0)
     for _ in range(_MAX_PLANES):
-        if len(left) < needed:
+        if len(left) < _MIN_POINTS:
             break
-        plane = _plane(left, float(np.median(margin_m)) if len(margin_m) else 0.0, rng)
-        is_on = np.abs(left @ plane[:3] - plane[3]) < np.median(margin_m)
-        if is_on.sum() < needed:
+        n, d = _plane(left, usual_m, rng)
+        holds = np.abs(left @ n - d) < usual_m
+        if holds.sum() < max(_MIN_POINTS, _MIN_SHARE * len(left)):
             break
-        is_behind |= points @ plane[:3] > plane[3] - margin_m
-        left = left[~is_on]
-    return is_behind
+        is_on |= np.abs(points @ n - d) < margin_m
+        left = left[~holds]
+    return is_on
 
 
-def _plane(points: FloatArray, margin_m: float, rng: np.random.Generator) -> FloatArray:
-    """Return the plane (4,) n, d with n @ p = d > 0 that most points lie on."""
+def _plane(
+    points: FloatArray, margin_m: float, rng: np.random.Generator
+) -> tuple[FloatArray, float]:
+    """Return the plane n @ p = d that most points lie on."""
     corners = points[rng.integers(len(points), size=(_NUM_TRIES, 3))]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     length = np.linalg.norm(normals, axis=1)
-    normals, corners = normals[length > 1e-9] / length[length > 1e-9, None], corners[length > 1e-9]
-    if not len(normals):
-        return np.array([0.0, 0.0, 1.0, np.inf])
+    is_good = length > 1e-9
+    if not is_good.any():
+        return np.array([0.0, 0.0, 1.0]), np.inf
+    normals, corners = normals[is_good] / length[is_good, None], corners[is_good]
     distances = np.einsum("ki,ki->k", normals, corners[:, 0])
     counts = (np.abs(points @ normals.T - distances) < margin_m).sum(axis=0)
     best = int(counts.argmax())
-    is_on = np.abs(points @ normals[best] - distances[best]) < margin_m
-    middle = points[is_on].mean(axis=0)
-    n = np.linalg.svd(points[is_on] - middle, full_matrices=False)[2][2]
-    d = float(n @ middle)
-    return np.append(n, d) if d > 0 else -np.append(n, d)
+    own = points[np.abs(points @ normals[best] - distances[best]) < margin_m]
+    middle = own.mean(axis=0)
+    n: FloatArray = np.linalg.svd(own - middle, full_matrices=False)[2][2]
+    return n, float(n @ middle)
