@@ -52,13 +52,13 @@ def _read(outputs: Outputs, fit: ImageFit, least_score: float, *, ends: _Ends) -
     whole = finite_rows(table[:, chosen].T)
     rows = table[:, chosen[whole]].T
     sure = rows[:, 4 : 4 + ends.num_classes]
-    middle, half = rows[:, :2], rows[:, 2:4] / 2
+    middle, sides = np.hsplit(rows[:, :4].astype(np.float64), 2)
     masks = None
     if ends.prototypes is not None:
         coefficients = rows[:, 4 + ends.num_classes :]
         masks = _Prototypes(outputs[ends.prototypes], coefficients, fit, ends.size_px)
     return Candidates(
-        boxes_px=fit.boxes(np.hstack([middle - half, middle + half])),
+        boxes_px=fit.boxes(np.hstack([middle - sides / 2, middle + sides / 2])),
         scores=sure.max(axis=1),
         classes=sure.argmax(axis=1),
         masks=masks,

@@ -49,13 +49,13 @@ def _read(
     rows = outputs[name]
     chosen = np.flatnonzero(~(rows[:, 4] < least_score))  # what is no number is chosen, and told of
     whole = finite_rows(rows[chosen])
-    rows, cells = rows[chosen[whole]], cells[chosen[whole]]
-    classes = rows[:, 5:].argmax(axis=1)
+    rows, cells = rows[chosen[whole]].astype(np.float64), cells[chosen[whole]]
+    sure = np.minimum(rows[:, 4:], 1.0)
     middle = (rows[:, :2] + cells[:, :2]) * cells[:, 2:]
     half = np.exp(np.minimum(rows[:, 2:4], _LARGEST)) * cells[:, 2:] / 2
     return Candidates(
         boxes_px=fit.boxes(np.hstack([middle - half, middle + half])),
-        scores=rows[:, 4] * rows[:, 5:].max(axis=1),
-        classes=classes,
+        scores=(sure[:, 0] * sure[:, 1:].max(axis=1)).astype(np.float32),
+        classes=rows[:, 5:].argmax(axis=1),
         num_broken=int(len(whole) - whole.sum()),
     )
