@@ -52,10 +52,11 @@ class Vocabulary:
             cells: (N, C).
             weights: (M, N) how much of each cell belongs to each part, from 0 to 1.
         """
-        points = self.points(cells)
+        used = np.flatnonzero(weights.any(axis=0))
+        points = self.points(cells[used])
         shares = self._shares(points)
         vectors = np.empty((len(weights), self.width), np.float32)
-        for row, weight in enumerate(weights):
+        for row, weight in enumerate(weights[:, used]):
             own = np.flatnonzero(weight)
             vectors[row] = self._beyond(points[own], weight[own, None] * shares[own]).reshape(-1)
         return _unit(np.sign(vectors) * np.sqrt(np.abs(vectors)))

@@ -37,12 +37,18 @@ class MaskedCells:
 
     def __init__(self, long_side_px: int) -> None:
         self._vocabulary = load_vocabulary()
-        self._cells = MobileNetCells(long_side_px)
+        self.cells = MobileNetCells(long_side_px)
 
     def vectors(self, image: RgbImage, objects: ObjectDetections) -> Float32Array:
         """Return the vectors (N, D); NaN for what is smaller than a cell."""
-        weights = covered(objects, self._cells.grid(image))
-        vectors = self._vocabulary.vectors(self._cells(image), weights)
+        return self.vectors_of(self.cells(image), self.cells.grid(image), objects)
+
+    def vectors_of(
+        self, cells: Float32Array, grid: tuple[int, int], objects: ObjectDetections
+    ) -> Float32Array:
+        """Return the same, of the cells (columns * rows, 96) of an image, which lie on a grid of columns and rows."""
+        weights = covered(objects, grid)
+        vectors = self._vocabulary.vectors(cells, weights)
         vectors[(weights.sum(axis=1) < 1) | ~vectors.any(axis=1)] = np.nan
         return vectors
 

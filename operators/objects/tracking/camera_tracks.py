@@ -161,16 +161,25 @@ class CameraTracks:
         return np.where(possible, np.where(np.isnan(appearance), motion, both), np.inf)
 
     def _appearance(self, possible: BoolArray, looks: Float32Array) -> FloatArray:
-        """Return cosine distances (T, N) as parts of their limits, for pairs that may be; NaN if not known."""
+        """Return cosine distances (T, N) as parts of their limits, for pairs that may be; NaN if not known.
+
+        Where a track and a detection have no other choice, it is enough that the track looked so when it was seen last.
+        """
         tracks = self._tracks
         found = np.full(possible.shape, np.nan)
         rows, columns = np.nonzero(possible & np.isfinite(looks[:, 0]))
         limits = self._each("max_appearance")[tracks.classes]
+        has_rivals = possible.sum(axis=0) > 1
         ends = np.searchsorted(rows, np.arange(len(tracks)), side="right").tolist()
         for row, (start, end) in enumerate(pairwise([0, *ends])):
+            of_row, gallery = columns[start:end], tracks.galleries[row]
+            if end - start == 1 and not has_rivals[of_row[0]]:
+                distance = gallery.last_distance(looks[of_row[0]])
+                if distance <= limits[row]:
+                    found[row, of_row] = distance / limits[row]
+                    continue
             if start < end:
-                of_row = columns[start:end]
-                found[row, of_row] = tracks.galleries[row].distances(looks[of_row]) / limits[row]
+                found[row, of_row] = gallery.distances(looks[of_row]) / limits[row]
         return found
 
     def _with_new(

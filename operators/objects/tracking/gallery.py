@@ -30,6 +30,12 @@ class Gallery:
         self._rows[at] = descriptor
         self._count += 1
 
+    def last_distance(self, descriptor: Float32Array) -> float:
+        """Return the cosine distance of a descriptor (D,) from the newest; infinite where there is none."""
+        if self._count == 0:
+            return np.inf
+        return 1 - float(descriptor @ self._rows[(self._count - 1) % self._size])
+
     def distances(self, descriptors: Float32Array) -> Float32Array:
         """Return the smallest cosine distance of each descriptor (N, D); NaN where one side has none."""
         kept = self._rows[: self._count]

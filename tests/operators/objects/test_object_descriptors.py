@@ -71,7 +71,7 @@ def mean_color(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.mark.slow
 def test_J2_an_object_from_two_views_is_nearer_than_others() -> None:
-    """W-RGBD: in at least 80 % of all triples of a thing, itself at least 2 s later, and another thing."""
+    """W-RGBD: in at least 80 % of all triples of a thing, itself at least 3 s apart, and another thing."""
     installed("mobilenet_v2")
     camera = {"width_px": 640, "height_px": 480}
     world = rgbd_world(WRgbdConfig.model_validate({"camera": camera, "texel_m": 0.005}), 0)
@@ -79,7 +79,7 @@ def test_J2_an_object_from_two_views_is_nearer_than_others() -> None:
     owner_of = np.array(
         [names.index(s.name) if s.name in names else -1 for s in world.room.surfaces]
     )
-    stamps_ns = START_NS + np.arange(1, 39, 2) * 1_000_000_000
+    stamps_ns = START_NS + np.arange(1, 39, 3) * 1_000_000_000
     looks = MaskedCells(640)
     vectors, things, moments = [], [], []
     for stamp_ns, T in zip(stamps_ns, orbit(40.0, START_NS).poses(stamps_ns), strict=True):
@@ -100,7 +100,7 @@ def test_J2_an_object_from_two_views_is_nearer_than_others() -> None:
         wins += (same[:, None] > other).sum()
         total += same.size * other.size
 
-    assert len(thing) > 60
+    assert len(thing) > 40
     np.testing.assert_allclose(np.linalg.norm(all_vectors, axis=1), 1, atol=1e-5)
     assert wins / total >= 0.8
 
