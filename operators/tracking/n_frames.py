@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from pydantic import Field, NonNegativeFloat
+from pydantic import Field, NonNegativeFloat, model_validator
 
 from mapstream.operators.operator import DynamicPorts, Operator, OperatorConfig, Ports, warn
 from mapstream.streams.channel import Sender
@@ -18,8 +18,16 @@ class NFramesConfig(OperatorConfig):
 
     inputs: tuple[str, ...] = Field(default=("features",), min_length=1)
     """One for each camera and kind of features; the n-frame holds them in this order."""
+    slower: tuple[str, ...] = ()
+    """Those of them that do not see at every moment; that one is missing is no warning."""
     tolerance_s: NonNegativeFloat = 0.0005
     """How far the images of one n-frame may be apart."""
+
+    @model_validator(mode="after")
+    def _check_slower(self) -> NFramesConfig:
+        if unknown := sorted(set(self.slower) - set(self.inputs)):
+            raise ValueError(f"slower: no input {unknown[0]}; there are {', '.join(self.inputs)}")
+        return self
 
 
 @dataclass(frozen=True)
@@ -52,6 +60,8 @@ class NFrames(DynamicPorts, Operator[Ports, Outputs]):
     def _joined(self, gathered: dict[int, ImageFeatures]) -> NFrame:
         names = self._config.inputs
         for number in set(range(len(names))) - gathered.keys():
+            if names[number] in self._config.slower:
+                continue
             warn(f"n-frames without {names[number]}: none within {self._config.tolerance_s:g} s")
         features = tuple(gathered[number] for number in sorted(gathered))
         return NFrame(stamp_ns=min(f.stamp_ns for f in features), features=features)

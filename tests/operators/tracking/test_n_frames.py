@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from pydantic import ValidationError
 
 from mapstream.operators.operator import Context
 from mapstream.operators.submaps.keyframes import Keyframes, KeyframesConfig
@@ -78,6 +79,26 @@ async def test_A3_images_further_apart_than_the_tolerance_stay_apart_and_are_cou
         "n-frames without right: none within 0.0005 s": 1,
         "n-frames without left: none within 0.0005 s": 1,
     }
+
+
+async def test_a_slower_sensor_is_not_missed() -> None:
+    config = NFramesConfig(inputs=("left", "lidar"), slower=("lidar",))
+    context = Context()
+    sent = await run_operator(
+        NFrames(config),
+        config=config,
+        run_context=context,
+        left=[features(0), features(PERIOD_NS), features(2 * PERIOD_NS)],
+        lidar=[features(0, "lidar"), features(2 * PERIOD_NS, "lidar")],
+    )
+
+    assert [len(n.features) for n in sent["n_frames"]] == [2, 1, 2]
+    assert context.activity.warnings == {}
+
+
+def test_a_slower_sensor_is_an_input() -> None:
+    with pytest.raises(ValidationError, match="no input radar; there are left"):
+        NFramesConfig(inputs=("left",), slower=("radar",))
 
 
 async def test_A14_keyframes_bring_features_into_the_map() -> None:
