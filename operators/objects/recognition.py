@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import combinations
 
 import numpy as np
 
@@ -64,6 +65,8 @@ class KnownObjects:
         self._known: dict[str, KnownObject] = {}  # by name, the oldest first
         self._of_track: dict[tuple[str, int], str] = {}  # names
         self._common: set[str] = set()  # texts that are on several things
+        self._together: set[frozenset[str]] = set()  # names of two that were seen at once
+        self._also: dict[str, list[KnownObject]] = {}  # what else a thing was, until it is seen
 
     @property
     def objects(self) -> list[KnownObject]:
@@ -75,7 +78,7 @@ class KnownObjects:
     ) -> list[tuple[KnownObject, ...]]:
         """Return which object each one is that is seen at one moment; none where two may be meant.
 
-        Who had no name and now shows its text is both: the one of that text, and the one that it was so far.
+        What turns out to be one with another one that was known is both, once; after that it is the first.
 
         Args:
             stamp_ns: Of the moment.
@@ -94,7 +97,7 @@ class KnownObjects:
                 continue
             name = names[row] or f"{self._prefix}:{stamp_ns}:{row}"
             before = self._known.get(name)
-            now = KnownObject(
+            self._known[name] = KnownObject(
                 name=name,
                 label=seen.label,
                 has_text=bool(text) or (before is not None and before.has_text),
@@ -104,14 +107,48 @@ class KnownObjects:
                 path_m=path_m,
                 p_base=T_base_frame[:3, :3] @ seen.p_frame + T_base_frame[:3, 3],
             )
-            found.append((now, *self._replaced(seen, now)))
+            if seen.track is not None:
+                self._follow(seen.track, name)
+            found.append((self._known[name], *self._also.pop(name, ())))
+        seen_now = [same[0].name for same in found if same]
+        self._together |= {frozenset(pair) for pair in combinations(seen_now, 2)}
         return found
 
     def move(self, T_frame_base_at: Callable[[int], FloatArray]) -> None:
-        """Put each object where it was seen last from, by the robot's poses (4, 4) at stamps as they are known now."""
+        """Put each object where it was seen last from, by the robot's poses (4, 4) at stamps as they are known now.
+
+        What so comes to lie in one place is one thing, which the next sighting measures.
+        """
         for name, known in self._known.items():
             T = T_frame_base_at(known.seen_ns)
             self._known[name] = replace(known, p_frame=T[:3, :3] @ known.p_base + T[:3, 3])
+        pairs = [(_distance_m(*pair), *pair) for pair in combinations(self.objects, 2)]
+        reach_m = self._gate.at_once_m / self._gate.ambiguity
+        for _, older, younger in sorted((p for p in pairs if p[0] < reach_m), key=lambda p: p[0]):
+            if self._may_be_one(older, younger):
+                stays, goes = (younger, older) if younger.has_text else (older, younger)
+                self._make_one(stays.name, goes)
+
+    def _may_be_one(self, a: KnownObject, b: KnownObject) -> bool:
+        are_known = {a.name, b.name} <= self._known.keys()
+        are_alike = a.label == b.label and not (a.has_text and b.has_text)
+        return are_known and are_alike and frozenset((a.name, b.name)) not in self._together
+
+    def _make_one(self, name: str, goes: KnownObject) -> None:
+        """Forget an object that is one of another name."""
+        del self._known[goes.name]
+        self._also.setdefault(name, []).extend((goes, *self._also.pop(goes.name, ())))
+        self._of_track |= {track: name for track, of in self._of_track.items() if of == goes.name}
+        self._together |= {
+            pair - {goes.name} | {name} for pair in self._together if goes.name in pair
+        }
+
+    def _follow(self, track: tuple[str, int], name: str) -> None:
+        """Note what a track is of; what it was before it showed its text is the same."""
+        before = self._known.get(self._of_track.get(track, name))
+        self._of_track[track] = name
+        if before is not None and before.name != name and not before.has_text:
+            self._make_one(name, before)
 
     def _identities(self, objects: Sequence[SeenObject]) -> list[str]:
         """Return the text of each object; what is on two things at once identifies neither, for good."""
@@ -158,20 +195,12 @@ class KnownObjects:
     def _near(self, seen: SeenObject, path_m: float) -> Iterator[tuple[str, float]]:
         """Yield names and distances [m] of the objects that one may be."""
         for known in self._known.values():
-            distance_m = float(np.linalg.norm(known.p_frame - seen.p_frame))
+            distance_m = _distance_m(known, seen)
             is_other = bool(seen.text) and known.has_text
             reach_m = self._gate.reach_m(path_m - known.path_m)
             if known.label == seen.label and not is_other and distance_m <= reach_m:
                 yield known.name, distance_m
 
-    def _replaced(self, seen: SeenObject, now: KnownObject) -> list[KnownObject]:
-        """Take an object in; return the one that its track was before it showed its text, and forget that."""
-        self._known[now.name] = now
-        if seen.track is None:
-            return []
-        before = self._known.get(self._of_track.get(seen.track, now.name))
-        self._of_track[seen.track] = now.name
-        if before is None or before.name == now.name or before.has_text:
-            return []
-        del self._known[before.name]
-        return [before]
+
+def _distance_m(a: SeenObject | KnownObject, b: SeenObject | KnownObject) -> float:
+    return float(np.linalg.norm(a.p_frame - b.p_frame))

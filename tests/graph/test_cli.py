@@ -105,7 +105,7 @@ class TestCheck:
     def test_parameter_that_is_not_written_as_one(self, mapstream: Terminal, graph: Path) -> None:
         assert mapstream("check", graph, "--param", "voxel").code == 2
 
-    @pytest.mark.parametrize("preset", ["lidar", "lidar_gicp"])
+    @pytest.mark.parametrize("preset", ["lidar", "lidar_gicp", "semantic", "semantic_recorded"])
     def test_presets_have_no_mistakes(self, mapstream: Terminal, preset: str) -> None:
         assert mapstream("check", preset).code == 0
 

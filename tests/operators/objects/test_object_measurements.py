@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from mapstream.operators.estimation.batch import optimize_map
+from mapstream.operators.maps.merge import merge
 from mapstream.operators.objects.object_measurements import (
     ObjectMeasurements,
     ObjectMeasurementsConfig,
@@ -22,7 +23,7 @@ from mapstream.recordings.maps.object_payload import object_payload
 from mapstream.recordings.maps.submaps import append_submap
 from mapstream.streams.geometry import SE3
 from mapstream.streams.messages.constraints import Constraint
-from mapstream.streams.messages.estimates import Odometry
+from mapstream.streams.messages.estimates import MapCorrection, Odometry
 from mapstream.streams.messages.objects import ObjectDetections
 from tests.operators.estimation.problems import factors_of
 from tests.operators.objects.made_detections import detections
@@ -76,9 +77,15 @@ async def names(*messages: ObjectDetections, **options: Any) -> str:  # noqa: AN
     return "".join(chr(ord("A") + order.index(name)) for name in made)
 
 
-async def mapped(constraints: Sequence[Constraint], odometry: Sequence[Odometry]) -> Map:
+async def mapped(
+    constraints: Sequence[Constraint], odometry: Sequence[Odometry], mission: str = ""
+) -> Map:
     config = TrajectoryConfig.model_validate(
-        {"sources": {"odometry": {"kind": "odometry"}}, "constraints": {"objects": {}}}
+        {
+            "sources": {"odometry": {"kind": "odometry"}},
+            "constraints": {"objects": {}},
+            "mission": mission,
+        }
     )
     out = await run_operator(
         Trajectory(config), config=config, odometry=odometry, objects=constraints
@@ -185,6 +192,43 @@ async def test_N8_what_shows_its_text_at_last_measures_both() -> None:
     assert await names(far, near, seen(3, (4, 0, 1), texts=("12",))) == "ABAB"
 
 
+@pytest.mark.parametrize(("num_cups", "expected"), [(1, "ABBBABAAAA"), (2, "ABCDCDCDACBDABABABAB")])
+async def test_N8_what_a_correction_brings_together_is_one_thing_unless_it_was_seen_at_once(
+    num_cups: int, expected: str
+) -> None:
+    """Odometry jumps by 2 m; what the optimizer makes of stamp 1 s counts 3 s later, for stamps as they were."""
+    drift = SE3.from_rotation(np.eye(3), [0, 2.0, 0])
+    odometry = [Odometry(stamp_ns=0, T_odom_base=SE3.identity())] + [
+        Odometry(stamp_ns=s * SECOND_NS, T_odom_base=drift) for s in range(1, 9)
+    ]
+    corrections = [
+        MapCorrection(
+            stamp_ns=s * SECOND_NS,
+            mission_id="ab" * 16,
+            stamps_ns=np.arange(s + 1) * SECOND_NS,
+            T_mission_base=np.tile(np.eye(4), (s + 1, 1, 1)),
+            T_mission_odom=drift.inverse(),
+        )
+        for s in (1, 4, 7)
+    ]
+    cups = [(4.0, 0.1 * k, 1.0) for k in range(num_cups)]
+    config = ObjectMeasurementsConfig(feedback_s=3.0)
+    operator = ObjectMeasurements(config)
+
+    out = await run_operator(
+        operator,
+        config=config,
+        detections=[seen(s, *cups) for s in range(9)],
+        odometry=odometry,
+        corrections=corrections,
+    )
+
+    found = [constraint.landmark.name for constraint in out["constraints"]]
+    order = list(dict.fromkeys(found))
+    assert "".join(chr(ord("A") + order.index(name)) for name in found) == expected
+    assert len(operator.known.objects) == num_cups
+
+
 def round_trip(drift_radps: float) -> tuple[list[SE3], list[Odometry]]:
     """A robot that drives once around a square of 10 m, and what a gyroscope with a bias makes of it."""
     truth, drifting, odometry = SE3.identity(), SE3.identity(), list[Odometry]()
@@ -233,6 +277,30 @@ async def test_N8_a_sign_seen_twice_pulls_a_drifting_trajectory_straight(
     drift_m = float(np.linalg.norm(odometry[-1].T_odom_base.t - poses[-1].t))
     assert drift_m > 2.0
     assert error_m < limit_m
+
+
+async def test_N8_a_sign_that_two_robots_read_puts_their_maps_together() -> None:
+    """The second robot begins 3 m aside, turned; its map does not know that until both are merged."""
+    T_first_second = SE3.exp([0, 0, 0.4, 3.0, -1.0, 0.0])
+    sign = SE3.from_rotation(np.array([[0.0, 0, -1], [1, 0, 0], [0, -1, 0]]), [4.0, 1.0, 1.5])
+    maps = []
+    for number, T_world_base in enumerate((SE3.identity(), T_first_second)):
+        quats = ((T_world_base @ T_base_camera).inverse() @ sign).quat_xyzw[None]
+        read = seen(
+            1,
+            sign.t.tolist(),
+            T_world_base=T_world_base,
+            texts=("EXIT 12",),
+            quats_camera_object_xyzw=quats,
+        )
+        maps.append(await mapped(await measured(read), still(), mission=f"robot {number}"))
+
+    merged, _ = merge(maps)
+    solved, _ = optimize_map(merged)
+
+    assert len(solved.landmarks) == 1
+    T = solved.missions.T_map_mission
+    np.testing.assert_allclose(np.linalg.inv(T[0]) @ T[1], T_first_second.matrix, atol=1e-3)
 
 
 async def test_objects_without_a_place_are_counted() -> None:
