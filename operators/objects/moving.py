@@ -1,6 +1,7 @@
 """Which things move: their middles go farther than they are unsure, and their points do not come to lie where they lay.
 
 The second question keeps what stands: from elsewhere one sees another part of it, and the middle of what is seen goes.
+From the other side one sees other points, too, but their middle is no farther away than the thing is long.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from mapstream.streams.arrays import BoolArray, Float32Array, FloatArray, IntArr
 
 _LEAST_REACH_M = 0.05
 _REACH_SHARE = 0.1  # of its size: so near lie points of one surface that was seen twice
-_JUMP = 0.4  # of its way; a thing that moves makes no such step at once
+_JUMP = 0.6  # of its way; a thing that moves makes no such step at once
 _SIDES = 2  # sightings on each side of one whose middles are smoothed
 
 
@@ -60,8 +61,10 @@ def is_moving(path: Path, config: MovingConfig) -> bool:
         return False
     if _is_jump(middles[a : b + 1], path.stamps_ns[a : b + 1]):
         return False
-    ends = (path.points[_most_typical(path, middles[end])] for end in (a, b))
-    return overlap(*ends) <= config.max_overlap
+    ends = [path.points[_most_typical(path, middles[end])] for end in (a, b)]
+    along = (middles[b] - middles[a]) / apart_m[a, b]
+    long_m = max(float(np.ptp(end @ along)) if len(end) else 0.0 for end in ends)
+    return bool(apart_m[a, b] > long_m) and overlap(*ends) <= config.max_overlap
 
 
 def _is_jump(middles: FloatArray, stamps_ns: IntArray) -> bool:

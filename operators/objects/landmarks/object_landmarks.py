@@ -13,18 +13,24 @@ from dataclasses import dataclass
 import numpy as np
 
 from mapstream.operators.landmarks.locating import REASONS
+from mapstream.operators.objects.landmarks.movers import moves
 from mapstream.operators.objects.landmarks.same import Matcher, SameConfig, Thing
 from mapstream.operators.objects.landmarks.sightings import Sightings, sightings_of
 from mapstream.operators.objects.landmarks.writing import KIND, written
+from mapstream.operators.objects.moving import MovingConfig
 from mapstream.recordings.maps.model import Map
 from mapstream.recordings.maps.object_payload import object_payload
 from mapstream.streams.arrays import IntArray
 
 _MAX_PASSES = 5
+_MOVES = "moves"
 
 
 class ObjectLandmarksConfig(SameConfig):
     """Options of `object_landmarks`."""
+
+    moving: MovingConfig | None = MovingConfig()
+    """When a tracked thing moves and is no landmark; null: never."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -48,37 +54,65 @@ class _Group:
 def object_landmarks(
     map_: Map, config: ObjectLandmarksConfig | None = None
 ) -> tuple[Map, ObjectLandmarksReport]:
-    """Return the map with one landmark for each object that its detections determine.
+    """Return the map with one landmark for each object that stands and that its detections determine.
 
     Landmarks that people named, and those that edges lead to, stay however rarely they were seen.
     So do those whose detections do not determine a place any more: they stay where they are.
     """
     config = config or ObjectLandmarksConfig()
     sightings = sightings_of(map_)
-    matcher = Matcher(sightings, config)
-    groups = begun = _with_landmarks(sightings)
-    things, reasons = list[Thing](), Counter[str]()
-    for _ in range(_MAX_PASSES):  # what one pass finds may tell the next where a left-over belongs
-        before = groups
-        tracks = [*before, *_without(sightings, before)]
-        split = [thing for each in tracks for thing in _things(matcher, each, config)]
-        found, parts = matcher.made_one(split)
-        things = [t for t in found if _is_held(map_, t) or _is_seen(sightings, t, config)]
-        reasons = Counter(part.place.outcome for part in parts)
-        reasons[REASONS[0]] += len(found) - len(things)
-        held = [part for part in parts if part.landmarks]
-        groups = [_Group(thing.members, thing.landmarks) for thing in [*things, *held]]
-        if [g.members.tobytes() for g in groups] == [g.members.tobytes() for g in before]:
-            break
-    kept = {row for group in groups for row in group.landmarks}
+    begun = _with_landmarks(sightings)
+    tracks = _tracks(sightings)
+    movers = [
+        each
+        for each in _not_in(begun, tracks, len(sightings))
+        if config.moving is not None and moves(map_, sightings, each.members, config.moving)
+    ]
+    standing = [each for each in tracks if each not in movers]
+    found = _found(map_, sightings, begun, standing, config)
+    kept = {row for group in found.groups for row in group.landmarks}
     goes = {row for group in begun for row in group.landmarks} - kept
-    done, num_with_extent = written(map_, sightings, things, sorted(goes))
+    done, num_with_extent = written(map_, sightings, found.things, sorted(goes))
+    reasons = found.reasons + Counter({_MOVES: len(movers)})
     return done, ObjectLandmarksReport(
         num_objects=int((done.landmarks.kind == KIND).sum()),
-        num_joined=_num_joined([*begun, *_without(sightings, begun)], len(sightings), things),
+        num_joined=_num_joined([*standing, *begun], len(sightings), found.things),
         num_with_extent=num_with_extent,
         not_found={reason: count for reason, count in sorted(reasons.items()) if count},
     )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Found:
+    things: list[Thing]
+    groups: list[_Group]  # of these, and landmarks that have no place any more
+    reasons: Counter[str]  # of tracks that are no thing
+
+
+def _found(
+    map_: Map,
+    sightings: Sightings,
+    begun: list[_Group],
+    tracks: list[_Group],
+    config: ObjectLandmarksConfig,
+) -> _Found:
+    """Return the things that landmarks and tracks are."""
+    matcher = Matcher(sightings, config)
+    found = _Found([], begun, Counter())
+    for _ in range(_MAX_PASSES):  # what one pass finds may tell the next where a left-over belongs
+        before = found.groups
+        groups = [*before, *_not_in(before, tracks, len(sightings))]
+        split = [thing for each in groups for thing in _things(matcher, each, config)]
+        whole, parts = matcher.made_one(split)
+        things = [t for t in whole if _is_held(map_, t) or _is_seen(sightings, t, config)]
+        reasons = Counter(part.place.outcome for part in parts)
+        reasons[REASONS[0]] += len(whole) - len(things)
+        held = [part for part in parts if part.landmarks]
+        now = [_Group(thing.members, thing.landmarks) for thing in [*things, *held]]
+        found = _Found(things, now, reasons)
+        if [g.members.tobytes() for g in now] == [g.members.tobytes() for g in before]:
+            break
+    return found
 
 
 def _with_landmarks(sightings: Sightings) -> list[_Group]:
@@ -86,19 +120,23 @@ def _with_landmarks(sightings: Sightings) -> list[_Group]:
     return [_Group(np.flatnonzero(sightings.landmarks == row), (row,)) for row in rows]
 
 
-def _without(sightings: Sightings, groups: list[_Group]) -> list[_Group]:
-    """Return the tracks of which nothing is in a group; what has a 3D point and no track is one of its own."""
+def _tracks(sightings: Sightings) -> list[_Group]:
+    """Return all tracks; what has a 3D point and no track is one of its own."""
     has_point = np.isfinite(sightings.views.points).all(axis=1)
-    numbers = np.arange(len(sightings))
-    keys = np.stack([sightings.missions, np.where(sightings.tracks >= 0, sightings.tracks, -1 - numbers)])
-    track = np.unique(keys, axis=1, return_inverse=True)[1].ravel()
-    is_done = np.zeros(len(track) + 1, np.bool_)
+    track = np.where(sightings.tracks >= 0, sightings.tracks, -1 - np.arange(len(sightings)))
+    group = np.unique(np.stack([sightings.missions, track]), axis=1, return_inverse=True)[1].ravel()
+    rows = np.flatnonzero((sightings.tracks >= 0) | has_point)
+    rows = rows[np.argsort(group[rows], kind="stable")]
+    cuts = np.flatnonzero(np.diff(group[rows])) + 1
+    return [_Group(members) for members in np.split(rows, cuts) if len(members)]
+
+
+def _not_in(groups: list[_Group], tracks: list[_Group], num_sightings: int) -> list[_Group]:
+    """Return the tracks of which nothing is in a group."""
+    is_in = np.zeros(num_sightings, np.bool_)
     for group in groups:
-        is_done[track[group.members]] = True
-    left = np.flatnonzero(~is_done[track] & ((sightings.tracks >= 0) | has_point))
-    left = left[np.argsort(track[left], kind="stable")]
-    cuts = np.flatnonzero(np.diff(track[left])) + 1
-    return [_Group(members) for members in np.split(left, cuts) if len(members)]
+        is_in[group.members] = True
+    return [track for track in tracks if not is_in[track.members].any()]
 
 
 def _things(matcher: Matcher, group: _Group, config: SameConfig) -> list[Thing]:

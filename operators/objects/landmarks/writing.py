@@ -11,10 +11,10 @@ import numpy as np
 from mapstream.operators.landmarks.merging import merge_landmarks
 from mapstream.operators.landmarks.removal import without_landmarks
 from mapstream.operators.objects.landmarks.boxes import UprightBox, upright_box
+from mapstream.operators.objects.landmarks.movers import map_points
 from mapstream.operators.objects.landmarks.same import Thing
 from mapstream.operators.objects.landmarks.sightings import Sightings
 from mapstream.recordings.maps.columns import IdArray
-from mapstream.recordings.maps.detections import points_of
 from mapstream.recordings.maps.ids import as_keys, derived_id, id_array
 from mapstream.recordings.maps.model import Map
 from mapstream.recordings.maps.object_payload import object_payload, payload_bytes
@@ -61,13 +61,9 @@ def _rows(map_: Map, things: Sequence[Thing]) -> list[int]:
 
 def _box(map_: Map, sightings: Sightings, thing: Thing) -> UprightBox | None:
     """Return the box around the points that all views of a thing saw."""
-    clouds, views = [np.empty((0, 3))], [np.empty(0, np.int64)]
-    for member in thing.members.tolist():
-        points = points_of(map_, int(sightings.detections[member])).astype(np.float64)
-        T = sightings.views.T_map_sensor[member]
-        clouds.append(points @ T[:3, :3].T + T[:3, 3])
-        views.append(np.full(len(points), sightings.images[member]))
-    return upright_box(np.concatenate(clouds), np.concatenate(views))
+    clouds = [map_points(map_, sightings, member) for member in thing.members.tolist()]
+    views = np.repeat(sightings.images[thing.members], [len(cloud) for cloud in clouds])
+    return upright_box(np.concatenate(clouds).astype(np.float64), views)
 
 
 def _table(

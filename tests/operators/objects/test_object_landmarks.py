@@ -215,3 +215,21 @@ def test_a_map_without_detections_stays_as_it_is() -> None:
 
     assert map_.digest() == Map.empty().digest()
     assert report.num_objects == 0
+
+
+def test_what_moves_is_no_landmark() -> None:
+    """A cart that is pushed through the room while the others stand."""
+    poses = around(20)
+    seen = []
+    for n, T in enumerate(poses):
+        cart = Thing("cart", (-0.6 + 0.06 * n, 0.5, 0.3), (0.4, 0.3, 0.6))
+        seen.append(detections(T, 100_000_000 * n, [CHAIR, cart], [0, 1], num_points=60))
+
+    map_, report = object_landmarks(map_of(poses, seen))
+    all_of_them, _ = object_landmarks(
+        map_of(poses, seen), ObjectLandmarksConfig(moving=None, min_share=0.1)
+    )
+
+    assert map_.landmarks.label.tolist() == ["chair"]
+    assert report.not_found == {"moves": 1}
+    assert "cart" in all_of_them.landmarks.label
