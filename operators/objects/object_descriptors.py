@@ -107,4 +107,6 @@ class ObjectDescriptors(Operator[Inputs, Outputs]):
         vectors = looks.vectors(rgb(frame), objects)
         for _ in range(int(np.isnan(vectors[:, 0]).sum())):
             warn(f"objects of {objects.frame} too small for a descriptor")
+        if np.isnan(vectors).all():
+            return replace(objects, descriptors=None, descriptor_kind="")
         return replace(objects, descriptors=vectors, descriptor_kind=looks.kind)

@@ -11,6 +11,7 @@ from itertools import pairwise
 
 import numpy as np
 
+from mapstream.operators.objects.detectors.suppression import distinct
 from mapstream.operators.objects.tracking.box_filter import (
     BoxFilter,
     BoxStates,
@@ -102,21 +103,20 @@ class CameraTracks:
         for _ in range(int((~is_box).sum())):
             warn(f"objects of {objects.frame} whose box has no area were dropped")
         rows = np.flatnonzero(is_box & (objects.scores >= self._each("min_score")[classes]))
-        rows = rows[np.argsort(-objects.scores[rows], kind="stable")]
         same = classes[rows, None] == classes[rows]
-        doubled = same & (overlaps(boxes[rows], boxes[rows]) > self._rules.max_overlap)
-        is_kept = np.ones(len(rows), np.bool_)
-        for row in np.flatnonzero(np.tril(doubled, -1).any(axis=1)).tolist():
-            is_kept[row] = not (doubled[row, :row] & is_kept[:row]).any()
-        return np.sort(rows[is_kept])
+        limit = self._rules.max_overlap
+        if np.triu(same & (overlaps(boxes[rows], boxes[rows]) > limit), 1).any():
+            found = objects.boxes_px[rows], objects.scores[rows], classes[rows]
+            rows = np.sort(rows[distinct(*found, max_overlap=limit, max_class_overlap=1.0)])
+        return rows
 
     def _looks_of(self, objects: ObjectDetections) -> Float32Array:
         """Return the descriptors (N, D) of unit length; NaN where there is none."""
         given = objects.descriptors
-        if given is None:
+        if given is None or not np.isfinite(given[:, :1]).any():
             return np.full((len(objects), max(self._looks[1], 1)), np.nan, np.float32)
         looks = (objects.descriptor_kind, given.shape[1])
-        if looks != self._looks and len(objects):
+        if looks != self._looks:
             if self._looks[1]:
                 warn(f"descriptors of {objects.frame} changed from {self._looks} to {looks}")
             self._looks = looks

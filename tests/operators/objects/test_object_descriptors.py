@@ -170,6 +170,18 @@ async def test_a_users_network_sees_nothing_but_the_object(mean_color: Path) -> 
     assert context.activity.warnings == {"objects of camera too small for a descriptor": 1}
 
 
+async def test_where_nothing_can_be_described_there_are_no_descriptors(mean_color: Path) -> None:
+    empty = np.zeros((128, 96), np.bool_)
+
+    sent = await run_operator(
+        ObjectDescriptors(ObjectDescriptorsConfig(model=mean_color)),
+        frames=[frame(np.zeros((128, 192, 3), np.uint8))],
+        detections=[objects([BOX], (empty,))],
+    )
+
+    assert sent["detections"][0].descriptors is None
+
+
 async def test_what_is_smaller_than_a_cell_has_no_descriptor() -> None:
     installed("mobilenet_v2")
     empty = np.zeros((128, 96), np.bool_)

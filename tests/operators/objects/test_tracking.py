@@ -178,6 +178,18 @@ def test_without_some_descriptors_motion_decides() -> None:
     assert len(set(ids[0])) == 3
 
 
+def test_an_image_without_any_descriptor_changes_nothing() -> None:
+    looks = unit(np.random.default_rng(1).normal(size=(3, 8)))
+    tracker = ObjectTracker(ObjectTrackerConfig())
+    ids = []
+
+    for k in range(8):
+        given = {4: None, 5: np.full((3, 8), np.nan), 6: np.empty((3, 0))}.get(k, looks)
+        ids.append(ids_of(tracker.track(seen(k / 10, descriptors=given, descriptor_kind="this"))))
+
+    assert ids[2:] == [ids[2]] * 6
+
+
 def test_another_network_starts_the_galleries_anew() -> None:
     tracker = ObjectTracker(ObjectTrackerConfig())
     rng, ids = np.random.default_rng(1), []
