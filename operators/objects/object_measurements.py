@@ -12,45 +12,25 @@ from typing import Any, ClassVar
 import numpy as np
 from pydantic import Field, NonNegativeFloat, PositiveFloat
 
-from mapstream.operators.feedback import Feedback
+from mapstream.operators.along_odometry import AlongOdometry, AlongOdometryOptions
 from mapstream.operators.objects.certainty import CertaintyOptions, center_sigmas_m
 from mapstream.operators.objects.recognition import Gate, KnownObject, KnownObjects, SeenObject
-from mapstream.operators.operator import (
-    DynamicPorts,
-    Operator,
-    Placement,
-    Ports,
-    offload,
-    report_loss,
-    warn,
-)
-from mapstream.operators.period import Period
-from mapstream.operators.planes.whereabouts import Whereabouts
-from mapstream.streams.arrays import Float32Array
+from mapstream.operators.operator import DynamicPorts, Operator, Placement, Ports, warn
+from mapstream.streams.arrays import Float32Array, FloatArray
 from mapstream.streams.channel import Sender
 from mapstream.streams.geometry import SE3
 from mapstream.streams.messages.constraints import Constraint, LandmarkRef
-from mapstream.streams.messages.estimates import MapCorrection, Odometry
 from mapstream.streams.messages.objects import ObjectDetections
 from mapstream.streams.messages.vision import NO_TRACK
-from mapstream.streams.sync import merge
 
 _LOST_M = 5.0  # way that counts for a step without odometry
-_LATE = "objects seen before or after all odometry"
 
 
-class ObjectMeasurementsConfig(CertaintyOptions):
+class ObjectMeasurementsConfig(AlongOdometryOptions, CertaintyOptions):
     """Options of `object_measurements`: inputs are `odometry`, those under `inputs`, and `corrections`."""
 
     inputs: tuple[str, ...] = ("detections",)
     """Names of the inputs that get objects, one for each camera."""
-    feedback_s: PositiveFloat | None = Field(
-        default=None,
-        description="with it there is an input `corrections`; each counts so long after its stamp, so that a "
-        "replay gives the same landmarks. It is longer than the submaps of the trajectory",
-    )
-    period_s: NonNegativeFloat = 0.0
-    """Of each camera one message in so long is used; 0: all are."""
     labels: tuple[str, ...] = ()
     """Classes that are measured; empty: all."""
     by_place: bool = True
@@ -98,50 +78,21 @@ class ObjectMeasurements(DynamicPorts, Operator[Ports, Outputs]):
             ambiguity=config.ambiguity,
         )
         self.known = KnownObjects(gate, config.prefix)
-        self._where = Whereabouts(lost_m=_LOST_M)
-        self._periods = [Period(config.period_s) for _ in config.inputs]
-        self._waiting: list[ObjectDetections] = []  # for the odometry of their time
-        self._feedback = Feedback(config.feedback_s) if config.feedback_s else None
+        self._along = AlongOdometry(
+            config, self.known, self.measure, lost_m=_LOST_M, what="objects"
+        )
 
     @classmethod
     def ports_for(cls, config: ObjectMeasurementsConfig) -> tuple[dict[str, Any], dict[str, Any]]:
-        inputs: dict[str, Any] = dict.fromkeys(config.inputs, ObjectDetections)
-        inputs["odometry"] = Odometry
-        if config.feedback_s is not None:
-            inputs["corrections"] = MapCorrection
-        return inputs, {}
+        return config.ports(ObjectDetections), {}
 
     async def run(self, inputs: Ports, outputs: Outputs) -> None:
-        cameras = [inputs[name] for name in self._config.inputs]
-        async for port, message in merge(*cameras, inputs["odometry"]):
-            if isinstance(message, ObjectDetections):
-                if self._periods[port].begins(message.stamp_ns):
-                    self._waiting.append(message)
-                continue
-            if self._feedback is not None:
-                for correction in await self._feedback.counting(
-                    inputs["corrections"], message.stamp_ns
-                ):
-                    self._where.correct(correction)
-                    self.known.move(self._where.at)
-            for constraint in await offload(self.follow, message):
-                await outputs.constraints.send(constraint)
-            outputs.constraints.advance(message.stamp_ns)
-        for _ in self._waiting:
-            report_loss(_LATE)
+        await self._along.run(inputs, outputs.constraints)
 
-    def follow(self, odometry: Odometry) -> list[Constraint]:
-        """Return the measurements up to a message of odometry."""
-        self._where.follow(odometry)
-        waiting, self._waiting = self._waiting, []
-        return [constraint for seen in waiting for constraint in self.measure(seen)]
-
-    def measure(self, detections: ObjectDetections) -> list[Constraint]:
-        """Return what one camera's objects say, seen between the last two messages of odometry."""
-        T_mission_base = self._where.note(detections.stamp_ns)
-        if T_mission_base is None:
-            report_loss(_LATE)
-            return []
+    def measure(
+        self, detections: ObjectDetections, T_mission_base: FloatArray, path_m: float
+    ) -> list[Constraint]:
+        """Return what one camera's objects say, seen from a pose (4, 4) after so much way."""
         centers = detections.centers_m
         if centers is None:
             centers = np.full((len(detections), 3), np.nan, np.float32)
@@ -157,7 +108,7 @@ class ObjectMeasurements(DynamicPorts, Operator[Ports, Outputs]):
             )
             for row, T in zip(rows, T_base_objects, strict=True)
         ]
-        found = self.known.see(detections.stamp_ns, objects, T_mission_base, self._where.path_m)
+        found = self.known.see(detections.stamp_ns, objects, T_mission_base, path_m)
         made = []
         for row, T, same in zip(rows, T_base_objects, found, strict=True):
             if not same:

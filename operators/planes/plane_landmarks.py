@@ -6,44 +6,25 @@ from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import numpy as np
-from pydantic import Field, NonNegativeFloat, PositiveFloat
+from pydantic import Field, PositiveFloat
 
-from mapstream.operators.feedback import Feedback
-from mapstream.operators.operator import (
-    DynamicPorts,
-    Operator,
-    OperatorConfig,
-    Placement,
-    Ports,
-    offload,
-    report_loss,
-)
-from mapstream.operators.period import Period
+from mapstream.operators.along_odometry import AlongOdometry, AlongOdometryOptions
+from mapstream.operators.operator import DynamicPorts, Operator, Placement, Ports
 from mapstream.operators.planes.known_planes import KnownPlanes, Reach
 from mapstream.operators.planes.seen_plane import SeenPlane
-from mapstream.operators.planes.whereabouts import Whereabouts
 from mapstream.recordings.maps.hulls import hull_payload
+from mapstream.streams.arrays import FloatArray
 from mapstream.streams.channel import Sender
 from mapstream.streams.geometry import SE3
 from mapstream.streams.messages.constraints import Constraint, LandmarkRef
-from mapstream.streams.messages.estimates import MapCorrection, Odometry
 from mapstream.streams.messages.planes import PlaneSegments
-from mapstream.streams.sync import merge
 
 
-class PlaneLandmarksConfig(OperatorConfig):
+class PlaneLandmarksConfig(AlongOdometryOptions):
     """Options of `plane_landmarks`: inputs are `odometry`, those under `inputs`, and `corrections`."""
 
     inputs: tuple[str, ...] = ("planes",)
     """Names of the inputs that get planes, one for each sensor."""
-    feedback_s: PositiveFloat | None = Field(
-        default=None,
-        description="with it there is an input `corrections`; each counts so long after its stamp, so that a "
-        "replay gives the same landmarks. It is longer than the submaps of the trajectory, which makes poses "
-        "all the time (period_s)",
-    )
-    period_s: NonNegativeFloat = 0.0
-    """Of each sensor one message in so long is used; 0: all are."""
     max_angle_deg: PositiveFloat = 10.0
     """Between a known plane and what is seen of it."""
     max_distance_m: PositiveFloat = 0.6
@@ -92,57 +73,28 @@ class PlaneLandmarks(DynamicPorts, Operator[Ports, Outputs]):
             full_after_m=config.full_after_m,
         )
         self.known = KnownPlanes(reach, config.prefix)
-        self._where = Whereabouts(lost_m=config.full_after_m)
-        self._periods = [Period(config.period_s) for _ in config.inputs]
-        self._waiting: list[PlaneSegments] = []  # for the odometry of their time
-        self._feedback = Feedback(config.feedback_s) if config.feedback_s else None
+        self._along = AlongOdometry(
+            config, self.known, self.measure, lost_m=config.full_after_m, what="planes"
+        )
 
     @classmethod
     def ports_for(cls, config: PlaneLandmarksConfig) -> tuple[dict[str, Any], dict[str, Any]]:
-        inputs: dict[str, Any] = dict.fromkeys(config.inputs, PlaneSegments)
-        inputs["odometry"] = Odometry
-        if config.feedback_s is not None:
-            inputs["corrections"] = MapCorrection
-        return inputs, {}
+        return config.ports(PlaneSegments), {}
 
     async def run(self, inputs: Ports, outputs: Outputs) -> None:
-        sensors = [inputs[name] for name in self._config.inputs]
-        async for port, message in merge(*sensors, inputs["odometry"]):
-            if isinstance(message, PlaneSegments):
-                if self._periods[port].begins(message.stamp_ns):
-                    self._waiting.append(message)
-                continue
-            if self._feedback is not None:
-                for correction in await self._feedback.counting(
-                    inputs["corrections"], message.stamp_ns
-                ):
-                    self._where.correct(correction)
-                    self.known.move(self._where.at)
-            for constraint in await offload(self.follow, message):
-                await outputs.constraints.send(constraint)
-            outputs.constraints.advance(message.stamp_ns)
-        for _ in self._waiting:
-            report_loss("planes seen before or after all odometry")
+        await self._along.run(inputs, outputs.constraints)
 
-    def follow(self, odometry: Odometry) -> list[Constraint]:
-        """Return the measurements up to a message of odometry."""
-        self._where.follow(odometry)
-        waiting, self._waiting = self._waiting, []
-        return [constraint for planes in waiting for constraint in self.measure(planes)]
-
-    def measure(self, planes: PlaneSegments) -> list[Constraint]:
-        """Return a measurement of each plane that a sensor saw between the last two messages of odometry."""
-        T_mission_base = self._where.note(planes.stamp_ns)
-        if T_mission_base is None:
-            report_loss("planes seen before or after all odometry")
-            return []
+    def measure(
+        self, planes: PlaneSegments, T_mission_base: FloatArray, path_m: float
+    ) -> list[Constraint]:
+        """Return a measurement of each plane that a sensor saw from a pose (4, 4), after so much way."""
         is_line = np.isinf(planes.covariances[:, 0, 0])
         poses = T_mission_base @ planes.T_base_plane
         pieces = [
             SeenPlane(pose, hull, bool(line))
             for pose, hull, line in zip(poses, planes.hulls_m, is_line, strict=True)
         ]
-        names = self.known.see(planes.stamp_ns, pieces, T_mission_base, self._where.path_m)
+        names = self.known.see(planes.stamp_ns, pieces, T_mission_base, path_m)
         return [
             self._constraint(planes, row, name) for row, same in enumerate(names) for name in same
         ]
