@@ -1,7 +1,7 @@
 """Which things move: their middles go farther than they are unsure, and their points do not come to lie where they lay.
 
 The second question keeps what stands: from elsewhere one sees another part of it, and the middle of what is seen goes.
-From the other side one sees other points, too, but their middle is no farther away than the thing is long.
+From the other side one sees other points, too, but their middle is no farther away than the thing is large.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ from mapstream.streams.arrays import BoolArray, Float32Array, FloatArray, IntArr
 _LEAST_REACH_M = 0.05
 _REACH_SHARE = 0.1  # of its size: so near lie points of one surface that was seen twice
 _JUMP = 0.6  # of its way; a thing that moves makes no such step at once
+_OTHER_SIDE_RAD = np.deg2rad(45)  # from so far round one sees other sides of a thing
 _SIDES = 2  # sightings on each side of one whose middles are smoothed
 
 
@@ -39,6 +40,7 @@ class Path:
     stamps_ns: IntArray  # (N,) rising
     centers: FloatArray  # (N, 3) [m]
     sigmas_m: FloatArray  # (N,)
+    eyes: FloatArray  # (N, 3) where the camera was
     points: tuple[Float32Array, ...]  # N of (K, 3)
 
     def __len__(self) -> int:
@@ -62,9 +64,16 @@ def is_moving(path: Path, config: MovingConfig) -> bool:
     if _is_jump(middles[a : b + 1], path.stamps_ns[a : b + 1]):
         return False
     ends = [path.points[_most_typical(path, middles[end])] for end in (a, b)]
-    along = (middles[b] - middles[a]) / apart_m[a, b]
-    long_m = max(float(np.ptp(end @ along)) if len(end) else 0.0 for end in ends)
-    return bool(apart_m[a, b] > long_m) and overlap(*ends) <= config.max_overlap
+    if _turned_rad(path.eyes[[a, b]] - middles[[a, b]]) > _OTHER_SIDE_RAD:
+        if apart_m[a, b] <= max(_longest_m(end) for end in ends):
+            return False
+    return overlap(*ends) <= config.max_overlap
+
+
+def _turned_rad(views: FloatArray) -> float:
+    """Return the angle between two directions (2, 3) from which a thing was seen."""
+    a, b = views
+    return float(np.arctan2(np.linalg.norm(np.cross(a, b)), a @ b))
 
 
 def _is_jump(middles: FloatArray, stamps_ns: IntArray) -> bool:
@@ -80,14 +89,17 @@ def _most_typical(path: Path, middle: FloatArray) -> int:
     return int(np.linalg.norm(path.centers - middle, axis=1).argmin())
 
 
+def _longest_m(points: Float32Array) -> float:
+    return float(np.ptp(points, axis=0).max()) if len(points) else 0.0
+
+
 def overlap(a: Float32Array, b: Float32Array) -> float:
     """Return the share of the points of one (N, 3) that lie beside points of the other (M, 3): of both the larger."""
     from scipy.spatial import cKDTree  # noqa: PLC0415  # takes long to import
 
     if not (len(a) and len(b)):
         return 0.0
-    sizes_m = [float(np.ptp(points, axis=0).max()) for points in (a, b)]
-    reach_m = max(_LEAST_REACH_M, _REACH_SHARE * min(sizes_m))
+    reach_m = max(_LEAST_REACH_M, _REACH_SHARE * min(_longest_m(a), _longest_m(b)))
     near: list[BoolArray] = [
         cKDTree(one).query(other, distance_upper_bound=reach_m)[0] <= reach_m
         for one, other in ((a, b), (b, a))

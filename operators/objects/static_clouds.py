@@ -160,6 +160,7 @@ class _Sight:
     label: str
     center: FloatArray  # (3,)
     sigma_m: float
+    eye: FloatArray  # (3,) the camera
     points: Float32Array  # (K, 3)
 
 
@@ -177,6 +178,7 @@ def _paths(sights: Sequence[dict[int, _Sight]]) -> Iterator[tuple[str, Path]]:
                 np.array([sight.stamp_ns for sight in seen[track]]),
                 np.array([sight.center for sight in seen[track]]),
                 np.array([sight.sigma_m for sight in seen[track]]),
+                np.array([sight.eye for sight in seen[track]]),
                 tuple(sight.points for sight in seen[track]),
             ),
         )
@@ -206,6 +208,7 @@ def _sight(
         label=objects.labels[row],
         center=R @ center_m + t,
         sigma_m=0.0 if sigmas_m is None else float(np.nan_to_num(sigmas_m[row])),
+        eye=t,
         points=(points @ R.T + t).astype(np.float32),
     )
 

@@ -33,6 +33,7 @@ def _path(map_: Map, sightings: Sightings, members: IntArray) -> Path:
         sightings.stamps_ns[members],
         sightings.views.points[members],
         sightings.views.point_sigmas_m[members],
+        sightings.views.T_map_sensor[members, :3, 3],
         tuple(map_points(map_, sightings, member) for member in members.tolist()),
     )
 

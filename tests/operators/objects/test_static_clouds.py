@@ -164,7 +164,8 @@ def path_of(centers: FloatArray, extent: tuple[float, float, float] = (0.4, 0.4,
         for center in centers
     )
     stamps_ns = START_NS + STEP_NS * np.arange(len(centers))
-    return Path(stamps_ns, centers, np.full(len(centers), 0.1), points)
+    eyes = np.tile([0.5, -6.0, 1.0], (len(centers), 1))
+    return Path(stamps_ns, centers, np.full(len(centers), 0.1), eyes, points)
 
 
 def walk(num: int = 12, speed: float = 0.1) -> FloatArray:
@@ -196,3 +197,19 @@ def test_what_shows_another_part_of_itself_stands() -> None:
     )
 
     assert not is_moving(replace(shelf, points=parts), MovingConfig())
+
+
+def test_what_is_seen_from_the_other_side_stands() -> None:
+    """The camera goes round a cupboard, whose front and back have no point in common."""
+    rng = np.random.default_rng(0)
+    angles = np.linspace(0, np.pi, 12)
+    eyes = np.column_stack([3 * np.cos(angles), 3 * np.sin(angles), np.ones(12)])
+    sides = [np.column_stack([np.full(200, 0.3 * np.cos(a)), rng.uniform(-0.5, 0.5, 200), rng.uniform(0, 2, 200)]) for a in angles]  # fmt: skip
+    centers = np.array([side.mean(axis=0) for side in sides])
+    points = tuple(side.astype(np.float32) for side in sides)
+    stamps_ns = START_NS + STEP_NS * np.arange(12)
+    seen = Path(stamps_ns, centers, np.full(12, 0.05), eyes, points)
+    still = replace(seen, eyes=eyes[:1].repeat(12, axis=0))
+
+    assert not is_moving(seen, MovingConfig())
+    assert is_moving(still, MovingConfig())
