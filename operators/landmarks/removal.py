@@ -17,6 +17,7 @@ from mapstream.operators.landmarks.views import (
 )
 from mapstream.operators.operator import OperatorConfig
 from mapstream.recordings.maps.model import Map
+from mapstream.recordings.maps.object_payload import named
 from mapstream.streams.arrays import BoolArray, FloatArray, IntArray
 
 
@@ -41,14 +42,18 @@ class RemovalReport:
 
 
 def remove_bad_landmarks(map_: Map) -> tuple[Map, RemovalReport]:
-    """Return the map without landmarks of bad quality."""
-    return without_landmarks(map_, map_.landmarks.quality == "bad")
+    """Return the map without landmarks of bad quality; those that people named stay."""
+    is_bad = (map_.landmarks.quality == "bad") & ~named(map_.landmarks)
+    return without_landmarks(map_, np.asarray(is_bad))
 
 
 def remove_invalid_observations(
     map_: Map, config: InvalidConfig | None = None
 ) -> tuple[Map, RemovalReport]:
-    """Return the map in which no landmark is far from where an observation saw it; lonely landmarks go."""
+    """Return the map in which no landmark is far from where an observation saw it.
+
+    Landmarks that nothing sees any more go, unless people named them.
+    """
     config = config or InvalidConfig()
     rows = np.flatnonzero(map_.observations.landmark >= 0)
     is_false = reprojection_errors_px(map_, rows) > config.max_reprojection_error_px
@@ -65,6 +70,7 @@ def remove_invalid_observations(
     lost[np.setdiff1d(landmarks, landmark[rows])] = True
     lost[map_.edges.landmark_a[map_.edges.landmark_a >= 0]] = False
     lost[map_.edges.landmark_b[map_.edges.landmark_b >= 0]] = False
+    lost[named(map_.landmarks)] = False
     left, report = without_landmarks(loose, lost)
     return left, replace(report, num_observations=int(is_false.sum()))
 

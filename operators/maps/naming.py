@@ -11,7 +11,7 @@ import numpy as np
 from mapstream.operators.maps.words import matches
 from mapstream.recordings.maps.hulls import area_of, hull_of
 from mapstream.recordings.maps.model import Map
-from mapstream.recordings.maps.object_payload import object_payload, payload_bytes
+from mapstream.recordings.maps.object_payload import named, object_payload, payload_bytes
 from mapstream.streams.arrays import FloatArray, IntArray
 from mapstream.streams.errors import MapError
 from mapstream.streams.geometry import invert
@@ -133,8 +133,7 @@ def things(map_: Map) -> IntArray:
     """Return the landmarks (rows) that people may mean: those with a class, a name or an outline."""
     landmarks = map_.landmarks
     is_thing = (landmarks.label != "") | np.isin(landmarks.kind, ("object", "plane", "pose"))
-    is_thing |= np.array([b'"name"' in payload for payload in landmarks.payload], dtype=bool)
-    return np.flatnonzero(is_thing)
+    return np.flatnonzero(is_thing | named(landmarks))
 
 
 def known_words(map_: Map) -> str:

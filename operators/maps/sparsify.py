@@ -13,6 +13,7 @@ import numpy as np
 from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveInt
 
 from mapstream.operators.landmarks.removal import without_landmarks
+from mapstream.operators.maps.naming import things
 from mapstream.operators.operator import OperatorConfig
 from mapstream.recordings.maps.model import Map
 from mapstream.streams.arrays import BoolArray, FloatArray, IntArray
@@ -68,7 +69,7 @@ class _Sight:
 
 
 def sparsify(map_: Map, config: SparsifyConfig | None = None) -> tuple[Map, SparsifyReport]:
-    """Return the map with the most useful of its landmarks; landmarks without observations stay."""
+    """Return the map with the most useful of its landmarks; things, and landmarks without observations, stay."""
     config = config or SparsifyConfig()
     sight = _sight(map_, config)
     num = len(sight.landmarks)
@@ -99,7 +100,9 @@ def _sight(map_: Map, config: SparsifyConfig) -> _Sight:
     from scipy.sparse import csr_array  # noqa: PLC0415  # takes most of a second to import
 
     seen = map_.observations
-    rows = np.flatnonzero(seen.landmark >= 0)
+    is_point = np.ones(len(map_.landmarks) + 1, bool)
+    is_point[things(map_)] = is_point[-1] = False  # the last is that of no landmark
+    rows = np.flatnonzero(is_point[seen.landmark])
     landmarks, column = np.unique(seen.landmark[rows], return_inverse=True)
     order = np.lexsort((map_.vertices.stamp_ns, map_.vertices.mission))
     place = np.empty(len(order))

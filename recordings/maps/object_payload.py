@@ -5,7 +5,10 @@ from __future__ import annotations
 import json
 from typing import Any
 
+import numpy as np
+
 from mapstream.recordings.maps.tables import Landmarks
+from mapstream.streams.arrays import BoolArray
 
 
 def object_payload(landmarks: Landmarks, row: int) -> dict[str, Any]:
@@ -20,6 +23,14 @@ def payload_of(payload: bytes) -> dict[str, Any]:
     except ValueError:  # of another program
         return {}
     return known if isinstance(known, dict) else {}
+
+
+def named(landmarks: Landmarks) -> BoolArray:
+    """Return which landmarks (L,) people gave a name."""
+    return np.array(
+        [b'"name"' in payload and "name" in payload_of(payload) for payload in landmarks.payload],
+        dtype=bool,
+    )
 
 
 def payload_bytes(known: dict[str, Any]) -> bytes:

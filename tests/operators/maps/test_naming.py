@@ -8,8 +8,10 @@ import numpy as np
 import pytest
 
 from mapstream.operators.landmarks.merging import merge_landmarks
+from mapstream.operators.landmarks.removal import remove_bad_landmarks, remove_invalid_observations
 from mapstream.operators.maps.naming import find_landmark, name_landmark
 from mapstream.operators.maps.regions import RegionConfig, add_region
+from mapstream.operators.maps.sparsify import SparsifyConfig, sparsify
 from mapstream.operators.maps.where import where
 from mapstream.operators.maps.words import matches
 from mapstream.recordings.maps import Map, check_map
@@ -18,7 +20,7 @@ from mapstream.recordings.maps.hulls import hull_of, hull_payload
 from mapstream.recordings.maps.ids import derived_id, id_array
 from mapstream.recordings.maps.object_payload import object_payload, payload_bytes
 from mapstream.recordings.maps.rows import concatenate
-from mapstream.recordings.maps.tables import Landmarks
+from mapstream.recordings.maps.tables import Landmarks, Observations
 from mapstream.streams.errors import MapError
 from mapstream.streams.geometry import SE3
 from mapstream.streams.messages.constraints import Constraint, LandmarkRef
@@ -84,6 +86,40 @@ def test_N9_of_two_that_are_one_the_name_stays() -> None:
     (found,) = where(merged, "my cup")
     assert found.position == pytest.approx([1.0, 1.0, 0.8])
     assert found.extent_m == pytest.approx([0.1, 0.1, 0.12])
+
+
+def seen_landmarks() -> Map:
+    """All landmarks were seen once, without a camera; they are bad, and are 9 m from where they were seen."""
+    map_, _ = name_landmark(furnished(), CUP, "my cup")
+    num = len(map_.landmarks)
+    observations = Observations(
+        vertex=np.zeros(num, np.int64),
+        landmark=np.arange(num),
+        sensor=np.array(["camera"] * num, dtype=object),
+        p_sensor=np.full((num, 3), 9.0, np.float32),
+    )
+    landmarks = replace(map_.landmarks, quality=np.array(["bad"] * num, dtype=object))
+    return replace(map_, landmarks=landmarks, observations=observations)
+
+
+def test_N9_what_people_named_is_not_removed() -> None:
+    """By quality all would go, by false observations all to which no edge leads, as one does to the table."""
+    map_ = seen_landmarks()
+
+    by_quality, _ = remove_bad_landmarks(map_)
+    by_sight, _ = remove_invalid_observations(map_)
+
+    assert [thing.name for thing in where(by_quality, "*")] == ["my cup"]
+    assert sorted(thing.label or thing.kind for thing in where(by_sight, "*")) == ["cup", "plane"]
+
+
+def test_things_stay_in_a_sparse_map() -> None:
+    map_ = seen_landmarks()
+
+    sparse, report = sparsify(map_, SparsifyConfig(num_landmarks=1))
+
+    assert report.num_before == 0
+    assert len(sparse.landmarks) == len(map_.landmarks)
 
 
 @pytest.mark.parametrize(
