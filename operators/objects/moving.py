@@ -64,9 +64,9 @@ def is_moving(path: Path, config: MovingConfig) -> bool:
     if _is_jump(middles[a : b + 1], path.stamps_ns[a : b + 1]):
         return False
     ends = [path.points[_most_typical(path, middles[end])] for end in (a, b)]
-    if _turned_rad(path.eyes[[a, b]] - middles[[a, b]]) > _OTHER_SIDE_RAD:
-        if apart_m[a, b] <= max(_longest_m(end) for end in ends):
-            return False
+    is_other_side = _turned_rad(path.eyes[[a, b]] - middles[[a, b]]) > _OTHER_SIDE_RAD
+    if is_other_side and apart_m[a, b] <= max(_longest_m(end) for end in ends):
+        return False
     return overlap(*ends) <= config.max_overlap
 
 

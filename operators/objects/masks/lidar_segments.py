@@ -32,6 +32,7 @@ class SeenPoints:
 
     points: FloatArray  # (N, 3) in the camera frame [m]
     px: FloatArray  # (N, 2)
+    up: FloatArray  # (3,) z of the base, in the camera frame
 
 
 def seen_points(points: FloatArray, T_camera_base: SE3, camera: CameraCalibration) -> SeenPoints:
@@ -41,7 +42,7 @@ def seen_points(points: FloatArray, T_camera_base: SE3, camera: CameraCalibratio
     px, is_seen = project(camera, moved)
     last = np.array([camera.width_px, camera.height_px]) - 0.5
     is_seen &= ((px >= -0.5) & (px < last)).all(axis=1)
-    return SeenPoints(moved[is_seen], px[is_seen])
+    return SeenPoints(moved[is_seen], px[is_seen], T_camera_base.R[:, 2])
 
 
 def lidar_segment(detections: ObjectDetections, row: int, seen: SeenPoints) -> Segment | None:
@@ -57,7 +58,7 @@ def lidar_segment(detections: ObjectDetections, row: int, seen: SeenPoints) -> S
     near = ((seen.px >= box[:2] - _AROUND * sides) & (seen.px <= box[2:] + _AROUND * sides)).all(axis=1)  # fmt: skip
     points, px = seen.points[chosen], seen.px[chosen]
     margin_m = np.full(len(points), _GROUND_M)
-    is_on = on_surround(points, seen.points[near & ~inside], margin_m)
+    is_on = on_surround(points, seen.points[near & ~inside], margin_m, seen.up)
     if (~is_on).mean() >= _MIN_LEFT and (~is_on).sum() >= _MIN_POINTS:
         points, px = points[~is_on], px[~is_on]
     pieces = pieces_of_points(points, _REACH_M + _REACH_SHARE * points[:, 2])

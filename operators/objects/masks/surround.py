@@ -11,9 +11,12 @@ _NUM_TRIES = 100
 _MIN_SHARE = 0.25  # of what is around and on no plane yet, that a plane must hold
 _MAX_PLANES = 3
 _MIN_POINTS = 20
+_LEVEL = 0.87  # cosine of 30 degrees
 
 
-def on_surround(points: FloatArray, around: FloatArray, margin_m: FloatArray) -> BoolArray:
+def on_surround(
+    points: FloatArray, around: FloatArray, margin_m: FloatArray, up: FloatArray | None = None
+) -> BoolArray:
     """Return which points (N, 3) lie on planes that go through what is around the box (M, 3).
 
     What is behind such a plane stays: a table ends, and shows what stands beyond it.
@@ -22,6 +25,7 @@ def on_surround(points: FloatArray, around: FloatArray, margin_m: FloatArray) ->
         points: In the camera frame [m].
         around: The same, of the surroundings.
         margin_m: Shape (N,), so far from a plane a point is still on it.
+        up: A direction (3,), if only level planes count; None: walls do as well.
     """
     is_on = np.zeros(len(points), np.bool_)
     if not len(points):
@@ -32,7 +36,7 @@ def on_surround(points: FloatArray, around: FloatArray, margin_m: FloatArray) ->
     for _ in range(_MAX_PLANES):
         if len(left) < _MIN_POINTS:
             break
-        n, d = _plane(left, usual_m, rng)
+        n, d = _plane(left, usual_m, rng, up)
         holds = np.abs(left @ n - d) < usual_m
         if holds.sum() < max(_MIN_POINTS, _MIN_SHARE * len(left)):
             break
@@ -42,13 +46,15 @@ def on_surround(points: FloatArray, around: FloatArray, margin_m: FloatArray) ->
 
 
 def _plane(
-    points: FloatArray, margin_m: float, rng: np.random.Generator
+    points: FloatArray, margin_m: float, rng: np.random.Generator, up: FloatArray | None
 ) -> tuple[FloatArray, float]:
-    """Return the plane n @ p = d that most points lie on."""
+    """Return the plane n @ p = d that most points lie on; d is infinite if there is none."""
     corners = points[rng.integers(len(points), size=(_NUM_TRIES, 3))]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     length = np.linalg.norm(normals, axis=1)
     is_good = length > 1e-9
+    if up is not None:
+        is_good &= np.abs(normals @ up) > _LEVEL * length
     if not is_good.any():
         return np.array([0.0, 0.0, 1.0]), np.inf
     normals, corners = normals[is_good] / length[is_good, None], corners[is_good]

@@ -67,15 +67,15 @@ def camera_sees(scene: Scene, pose: SE3, noise_m: float = 0.0) -> tuple[CameraFr
 
 
 def lidar_sees(scene: Scene, pose: SE3) -> tuple[PointCloud, FloatArray]:
-    """A cloud in the base frame, the camera's, of beams 0.4 deg apart; and the points on the box."""
+    """A cloud of beams 0.4 deg apart in a base that stands upright at the camera, and the points on the box."""
     azimuth, elevation = np.meshgrid(np.deg2rad(np.arange(-40, 40, 0.2)), np.deg2rad(np.arange(-20, 4, 0.4)))  # fmt: skip
     x, y = np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth)
     rays = np.stack([x, y, np.sin(elevation)], axis=-1).reshape(-1, 3)
     range_m, is_box = scene.cast(pose.t, rays)
     seen = range_m < 40
     points = pose.t + rays[seen] * range_m[seen, None]
-    base = (points - pose.t) @ pose.R
-    return PointCloud(stamp_ns=STAMP_NS, points=base.astype(np.float32)), base[is_box[seen]]
+    base = points - pose.t
+    return PointCloud(stamp_ns=STAMP_NS, points=base.astype(np.float32)), points[is_box[seen]]
 
 
 def detected(*masks: BoolArray, grow_px: float = 3.0, **more: object) -> ObjectDetections:
@@ -95,6 +95,11 @@ def detected(*masks: BoolArray, grow_px: float = 3.0, **more: object) -> ObjectD
         "camera": CAMERA,
     }
     return ObjectDetections(**{**given, **more})  # type: ignore[arg-type]  # by name
+
+
+def upright(objects: ObjectDetections) -> ObjectDetections:
+    """The camera on a base that stands upright, as that of the clouds."""
+    return replace(objects, T_base_sensor=SE3.from_rotation(STREET.R, [0.0, 0, 0]))
 
 
 def masks_of(**config: float) -> ObjectMasks:
@@ -176,12 +181,12 @@ def test_a_lidar_gives_the_points_of_a_car_without_road_and_house() -> None:
     _, truth = camera_sees(car, STREET)
     cloud, on_car = lidar_sees(car, STREET)
 
-    found = masks_of(max_points=10_000).with_masks(detected(truth), cloud=cloud)
+    found = masks_of(max_points=10_000).with_masks(upright(detected(truth)), cloud=cloud)
 
     assert found.mask_sources == ("lidar",)
     world = found.points_m[0] @ STREET.R.T + STREET.t
     is_own = ((world > np.array(car.low) - 0.05) & (world < np.array(car.high) + 0.05)).all(axis=1)
-    above = (on_car @ STREET.R.T + STREET.t)[:, 2] > 0.25
+    above = on_car[:, 2] > 0.25
     assert is_own.mean() > 0.98
     assert is_own.sum() > 0.95 * above.sum()
     assert iou(found.full_mask(0), truth) > 0.7
@@ -191,16 +196,16 @@ def test_a_cloud_of_another_time_is_moved_by_the_odometry() -> None:
     """The robot drives 0.5 m towards the car between cloud and image."""
     car = Scene((-2.0, -0.9, 0.0), (2.0, 0.9, 1.5), wall_x=6.0)
     _, truth = camera_sees(car, STREET)
-    forward = SE3.from_rotation(np.eye(3), STREET.R.T @ [0.5, 0, 0])
-    cloud, _ = lidar_sees(car, STREET @ forward.inverse())
+    forward = SE3.from_rotation(np.eye(3), [0.5, 0, 0])
+    cloud, _ = lidar_sees(car, SE3.from_rotation(STREET.R, STREET.t - [0.5, 0, 0]))
     early = replace(cloud, stamp_ns=STAMP_NS - 20_000_000)
     path = [
         Odometry(stamp_ns=early.stamp_ns, T_odom_base=SE3.identity()),
         Odometry(stamp_ns=STAMP_NS, T_odom_base=forward),
     ]
 
-    moved = masks_of().with_masks(detected(truth), cloud=early, odometry=path)
-    still = masks_of().with_masks(detected(truth), cloud=early)
+    moved = masks_of().with_masks(upright(detected(truth)), cloud=early, odometry=path)
+    still = masks_of().with_masks(upright(detected(truth)), cloud=early)
 
     assert moved.centers_m is not None
     assert still.centers_m is not None
