@@ -91,8 +91,9 @@ class ObjectSearch:
         found.verdict[~(self._is_sure[found.a] & self._is_sure[found.b])] = UNSURE
         loops: list[Loop] = []
         left = found.open
-        while len(left) >= self._config.verification.min_objects:
-            pairs = Pairs(objects, self._near, found.taken(left), self._config.verification)
+        config = self._config.verification
+        while len(left) >= config.min_objects:
+            pairs = Pairs(objects, self._near, self._together, found.taken(left), config)
             agreement = pairs.best()
             if agreement is None:
                 break

@@ -61,10 +61,16 @@ class Pairs:
         self,
         objects: PlacedObjects,
         near: BoolArray,
+        together: BoolArray,
         pairs: Candidates,
         config: VerificationConfig,
     ) -> None:
         self._objects, self._near, self._config = objects, near, config
+        self._distance_m = np.linalg.norm(objects.positions[:, None] - objects.positions, axis=2)
+        alike = objects.label[:, None] == objects.label
+        # parts of one thing that was not recognised as one, or the same part
+        self._may_be_one: BoolArray = near & alike & (self._distance_m <= config.max_error_m)
+        self._may_be_one &= ~together | np.eye(len(objects), dtype=np.bool_)
         self._a, self._b = pairs.a, pairs.b
         self._max_turn_rad, self._max_tilt_rad = pairs.max_turn_rad, pairs.max_tilt_rad
         self._said = self._consistency(pairs.a, pairs.b, pairs.max_turn_rad)
@@ -96,7 +102,7 @@ class Pairs:
             explained=explained,
             T_a_b=T,
             chance=self._chance(pairs),
-            num_rival=self._rival(fits[order], counts[order], explained, len(pairs)),
+            num_rival=self._rival(fits[order], counts[order], explained),
             rmse_m=float(np.sqrt((off**2).sum(axis=1).mean())),
         )
 
@@ -203,22 +209,19 @@ class Pairs:
         chosen = chosen[chosen >= 0]
         kept: list[int] = []
         for n in chosen[np.argsort(in_sigmas[chosen], kind="stable")].tolist():
-            if all(
-                self._said.distances_agree[pairs[n], other] or self._is_apart(pairs[n], other)
-                for other in kept
-            ):
+            if not any(self._is_again(pairs[n], other) for other in kept):
                 kept.append(int(pairs[n]))
         return np.sort(np.array(kept, np.int64))
 
-    def _is_apart(self, pair: int, other: int) -> bool:
-        """Whether the objects of two pairs are not two parts of one, in neither place."""
-        p = self._objects.positions
-        sigma_m = np.sqrt(np.trace(self._objects.covariances, axis1=1, axis2=2) / 3)
-        return all(
-            float(np.linalg.norm(p[rows[pair]] - p[rows[other]]))
-            > sigma_m[rows[pair]] + sigma_m[rows[other]]
-            for rows in (self._a, self._b)
-        )
+    def _is_again(self, pair: int, other: int) -> bool:
+        """Whether the objects of two pairs are likely two parts of one, in either place."""
+        variance = np.trace(self._objects.covariances, axis1=1, axis2=2) / 3
+        for rows in (self._a, self._b):
+            m, n = rows[pair], rows[other]
+            reach_m = self._config.num_sigmas * np.sqrt(variance[m] + variance[n])
+            if self._may_be_one[m, n] and self._distance_m[m, n] <= reach_m:
+                return True
+        return False
 
     def _chance(self, pairs: IntArray) -> float:
         """Return how many sets of so many pairs would agree if objects were anywhere."""
@@ -236,14 +239,15 @@ class Pairs:
         ways = np.poly(-counts.astype(np.float64))[num]  # each object of b has one partner, or none
         return float(ways * by_direction ** (num - 1) * by_distance ** (2 * num - 5))
 
-    def _rival(self, fits: BoolArray, counts: IntArray, explained: IntArray, num: int) -> int:
+    def _rival(self, fits: BoolArray, counts: IntArray, explained: IntArray) -> int:
         """Return how many pairs another motion explains, at least half of them pairs that the best does not."""
-        least = max(self._config.max_rival_share * num, 1.0)
+        may_be_one = self._may_be_one
+        again = may_be_one[np.ix_(self._a, self._a[explained])]
+        again &= may_be_one[np.ix_(self._b, self._b[explained])]
+        is_new = ~again.any(axis=1)
+        least = max(self._config.max_rival_share * self._one_to_one_bound(explained), 1.0)
         for row, count in zip(fits, counts.tolist(), strict=True):
-            if count < least:
-                break
-            pairs = np.flatnonzero(row)
-            if 2 * self._one_to_one_bound(np.setdiff1d(pairs, explained)) >= count:
+            if count >= least and 2 * self._one_to_one_bound(np.flatnonzero(row & is_new)) >= count:
                 return int(count)
         return 0
 

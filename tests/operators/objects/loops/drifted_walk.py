@@ -7,6 +7,7 @@ from itertools import pairwise
 
 import numpy as np
 
+from mapstream.operators.estimation.batch import OptimizeConfig, optimize_map
 from mapstream.operators.maps.relax import relax_map
 from mapstream.operators.objects.landmarks.object_landmarks import (
     ObjectLandmarksConfig,
@@ -102,15 +103,24 @@ def _step(a: Keyframe, b: Keyframe) -> RelativePose:
     )
 
 
-def closed(map_: Map, rounds: int = 2) -> Map:
+def closed(map_: Map, *, rounds: int = 2, gap_s: float = 10.0) -> Map:
     """Return the map after its semantic loops were closed, and again with the better poses, and relaxed."""
-    one = ObjectLandmarksConfig(max_gap_s=10.0)
     for turn in range(rounds):
         gate = AFTER_LOOPS if turn else DriftGate()
-        map_, _ = object_landmarks(map_, one)
-        map_, _ = close_semantic_loops(map_, SemanticLoopsConfig(gate=gate))
+        map_, _ = object_landmarks(map_, ObjectLandmarksConfig(max_gap_s=gap_s))
+        map_, _ = close_semantic_loops(map_, SemanticLoopsConfig(gate=gate, min_gap_s=gap_s))
         map_, _ = relax_map(map_)
     return map_
+
+
+def adjusted(map_: Map) -> Map:
+    """Return the map after objects seen again became one, and bundle adjustment by all that see them.
+
+    The middle of a box tells the direction of an object well; the middle of what is seen of it is nearer than its own.
+    """
+    map_, _ = object_landmarks(map_)
+    config = OptimizeConfig(without=("points",), losses={"keypoints": "cauchy"})
+    return optimize_map(map_, config)[0]
 
 
 @dataclass(frozen=True)
