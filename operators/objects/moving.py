@@ -26,7 +26,7 @@ class MovingConfig(OperatorConfig):
 
     min_distance_m: PositiveFloat = 0.3
     """Which its middle must go."""
-    min_sigma: PositiveFloat = 3.0
+    min_sigma: PositiveFloat = 2.0
     """The same, in standard deviations of both places."""
     max_overlap: float = Field(default=0.4, ge=0, le=1)
     """Of its points, no more may lie where some of it lay before."""
