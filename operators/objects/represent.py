@@ -24,7 +24,7 @@ class RepresentObjectsConfig(OperatorConfig):
 
     max_per_object: PositiveInt = 8
     """Descriptors that stand for one object, at most."""
-    min_silhouette: float = Field(default=0.25, ge=-1.0, le=1.0)
+    min_silhouette: float = Field(default=0.15, ge=-1.0, le=1.0)
     """Of a division into clusters that counts; an object without one has a single descriptor."""
 
 
