@@ -52,8 +52,9 @@ class ObjectTracker(Operator[Inputs, Outputs]):
             self._last_ns[objects.frame] = objects.stamp_ns
             await outputs.detections.send(await offload(self.track, objects))
         if self._best_score > 0 and not self._num_tracked:
-            rules = f"min_score {self._config.min_score:g}, num_hits {self._config.num_hits}"
-            warn(f"no object was tracked; the best score was {self._best_score:.2f} ({rules})")
+            config = self._config
+            limits = f"min_score {config.min_score:g}, num_hits {config.num_hits}, max_age_s {config.max_age_s:g}"
+            warn(f"no object was tracked; the best score was {self._best_score:.2f} ({limits})")
 
     def track(self, objects: ObjectDetections) -> ObjectDetections:
         """Return the objects of confirmed tracks in the next image of a camera."""
