@@ -55,8 +55,21 @@ def center_sigmas_m(detections: ObjectDetections, options: CertaintyOptions) -> 
     given = detections.center_sigmas_m
     sigmas_m = np.full(len(detections), np.nan) if given is None else given.astype(np.float64)
     sigmas_m = np.where(np.isfinite(sigmas_m), sigmas_m, POINT_SIGMA_M)
-    if detections.camera is None:
-        return sigmas_m
-    m_per_px = np.nan_to_num(detections.centers_m[:, 2]) / detections.camera.focal_px.mean()
-    off_m = middle_sigmas_px(detections, options) * m_per_px
+    off_m = middle_sigmas_px(detections, options) * _m_per_px(detections)
     return np.where(is_cut(detections, options.border_px), np.hypot(sigmas_m, off_m), sigmas_m)
+
+
+def sizes_m(detections: ObjectDetections) -> FloatArray:
+    """Return the longer sides of the boxes (N,) at the depth of the objects [m]; 0 where that is not known."""
+    boxes = detections.boxes_px.astype(np.float64)
+    sides_px: FloatArray = (boxes[:, 2:] - boxes[:, :2]).max(axis=1, initial=0)
+    return sides_px * _m_per_px(detections)
+
+
+def _m_per_px(detections: ObjectDetections) -> FloatArray:
+    """Return how wide a pixel is at the depth of each object (N,); 0 where that is not known."""
+    if detections.camera is None or detections.centers_m is None:
+        return np.zeros(len(detections))
+    depths_m = np.nan_to_num(detections.centers_m[:, 2].astype(np.float64))
+    widths_m: FloatArray = depths_m / detections.camera.focal_px.mean()
+    return widths_m

@@ -13,7 +13,7 @@ import numpy as np
 from pydantic import Field, NonNegativeFloat, PositiveFloat
 
 from mapstream.operators.along_odometry import AlongOdometry, AlongOdometryOptions
-from mapstream.operators.objects.certainty import CertaintyOptions, center_sigmas_m
+from mapstream.operators.objects.certainty import CertaintyOptions, center_sigmas_m, sizes_m
 from mapstream.operators.objects.recognition import Gate, KnownObject, KnownObjects, SeenObject
 from mapstream.operators.operator import DynamicPorts, Operator, Placement, Ports, warn
 from mapstream.streams.arrays import Float32Array, FloatArray
@@ -31,6 +31,8 @@ class ObjectMeasurementsConfig(AlongOdometryOptions, CertaintyOptions):
 
     inputs: tuple[str, ...] = ("detections",)
     """Names of the inputs that get objects, one for each camera."""
+    period_s: NonNegativeFloat = 1.0
+    """Of each camera one message in so long is used; views that are alike err alike. 0: all are."""
     labels: tuple[str, ...] = ()
     """Classes that are measured; empty: all."""
     by_place: bool = True
@@ -44,6 +46,10 @@ class ObjectMeasurementsConfig(AlongOdometryOptions, CertaintyOptions):
         default=2.0,
         ge=1,
         description="the second nearest of its class must be so many times as far",
+    )
+    center_share: NonNegativeFloat = Field(
+        default=0.1,
+        description="uncertainty of a centre as a share of the thing's longer side: one sees a thing from one side",
     )
     rotation_sigma_rad: PositiveFloat = 0.1
     """Of the orientation of a thing, where its detector knows one."""
@@ -130,10 +136,15 @@ class ObjectMeasurements(DynamicPorts, Operator[Ports, Outputs]):
                 warn(f"objects of {detections.frame} whose place in space is not known")
         return rows
 
+    def _sigma_m(self, detections: ObjectDetections, row: int) -> float:
+        """Return how sure a centre is along each axis, with what nobody sees of the thing."""
+        hidden_m = self._config.center_share * sizes_m(detections)[row]
+        return float(np.hypot(center_sigmas_m(detections, self._config)[row], hidden_m))
+
     def _constraint(
         self, detections: ObjectDetections, row: int, T_base_object: SE3, known: KnownObject
     ) -> Constraint:
-        sigma_m = float(center_sigmas_m(detections, self._config)[row])
+        sigma_m = self._sigma_m(detections, row)
         is_turned = known.is_pose and _is_oriented(detections, row)
         sigma_rad = self._config.rotation_sigma_rad if is_turned else np.inf
         return Constraint(

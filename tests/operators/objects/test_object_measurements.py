@@ -265,9 +265,10 @@ async def test_N8_a_sign_seen_twice_pulls_a_drifting_trajectory_straight(
         signs.append(
             seen(s, sign.t.tolist(), T_world_base=poses[s], quats_camera_object_xyzw=quats, **more)
         )
+    sure = {"rotation_sigma_rad": 0.01, "center_share": 0.0}
     gate = {"gate_per_m": 0.1, "most_gate_m": 5.0}
 
-    constraints = await measured(*signs, odometry=odometry, rotation_sigma_rad=0.01, **gate)
+    constraints = await measured(*signs, odometry=odometry, **sure, **gate)
     solved, _ = optimize_map(await mapped(constraints, odometry))
 
     assert check_map(solved) == []
@@ -301,6 +302,13 @@ async def test_N8_a_sign_that_two_robots_read_puts_their_maps_together() -> None
     assert len(solved.landmarks) == 1
     T = solved.missions.T_map_mission
     np.testing.assert_allclose(np.linalg.inv(T[0]) @ T[1], T_first_second.matrix, atol=1e-3)
+
+
+async def test_a_large_thing_is_less_sure_where_it_is() -> None:
+    """20 px at 4 m with f = 50 px are 1.6 m; a tenth of that joins the 5 cm of a centre that says nothing."""
+    (made,) = await measured(seen(1, (4.1, 0, 0.5)))
+
+    assert np.sqrt(made.covariance[3, 3]) == pytest.approx(np.hypot(0.05, 0.16), rel=1e-3)
 
 
 async def test_objects_without_a_place_are_counted() -> None:
