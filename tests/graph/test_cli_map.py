@@ -52,6 +52,7 @@ CHANGES = {  # command -> a part of what it says
     "edit disturb --set seed=3": "6 vertices",
     "remove line --start-ns 1000 --end-ns 500001000": "2 vertices removed",
     "merge other": "2 missions, 10 vertices",
+    "region add dock --polygon 1,0.5": "place 'dock'",
 }
 
 

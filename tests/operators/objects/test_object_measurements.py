@@ -7,6 +7,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from mapstream.operators.estimation.batch import optimize_map
 from mapstream.operators.maps.merge import merge
@@ -14,6 +16,7 @@ from mapstream.operators.objects.object_measurements import (
     ObjectMeasurements,
     ObjectMeasurementsConfig,
 )
+from mapstream.operators.objects.recognition import Gate, KnownObjects, SeenObject
 from mapstream.operators.operator import Context
 from mapstream.operators.testing import run_operator
 from mapstream.operators.trajectory.config import TrajectoryConfig
@@ -144,6 +147,42 @@ async def test_N8_without_a_text_class_and_place_decide(
     again: Sequence[float], options: dict[str, Any], expected: str
 ) -> None:
     assert await names(seen(1, (4, 0, 1)), seen(2, again), **options) == expected
+
+
+_THING = st.tuples(
+    st.floats(-1, 1),
+    st.sampled_from(["cup", "chair"]),
+    st.sampled_from(["", "12", "13"]),
+    st.integers(-1, 3),
+)  # place, class, text, track
+
+
+@given(st.lists(st.lists(_THING, max_size=4), max_size=5))
+def test_N8_what_is_seen_at_once_is_never_one_thing(
+    moments: list[list[tuple[float, str, str, int]]],
+) -> None:
+    """Whatever texts and tracks say; of things that are known, classes stay, unless a text says otherwise."""
+    gate = Gate(at_once_m=0.5, per_m=0.1, most_m=2.0, ambiguity=1.5)
+    known = KnownObjects(gate, "object")
+    for stamp_ns, moment in enumerate(moments):
+        before = {each.name: each.label for each in known.objects}
+        objects = [
+            SeenObject(
+                label=label,
+                p_frame=np.array([x, 0, 0]),
+                text=text,
+                track=None if track < 0 else ("camera", track),
+            )
+            for x, label, text, track in moment
+        ]
+
+        found = known.see(stamp_ns, objects, np.eye(4), float(stamp_ns))
+
+        names = [same[0].name for same in found if same]
+        assert len(names) == len(set(names))
+        for seen_object, same in zip(objects, found, strict=True):
+            if same and not seen_object.text and seen_object.track is None:
+                assert before.get(same[0].name, seen_object.label) == seen_object.label
 
 
 async def test_N8_classes_never_meet() -> None:
