@@ -70,6 +70,7 @@ class ObjectDescriptors(Operator[Inputs, Outputs]):
         looks = await anyio.to_thread.run_sync(self.open)
         images: dict[str, CameraFrame] = {}  # the last of each camera
         async for _, message in merge(inputs.frames, inputs.detections):
+            outputs.detections.advance(message.stamp_ns)
             if isinstance(message, CameraFrame):
                 images[message.frame] = message
                 continue
