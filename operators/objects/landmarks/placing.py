@@ -190,10 +190,15 @@ def _taken(rays: Rays, chosen: BoolArray) -> Rays:
 
 
 def _size_m(sightings: Sightings, members: IntArray, distance_m: FloatArray) -> float:
-    """Return how large a thing is across: what the border cuts shows less than all of it."""
-    if not len(members):
-        return float("nan")
+    """Return how large a thing is across: what the border cuts shows less than all of it.
+
+    It is 0 where nobody knows, for want of a calibration.
+    """
     seen_m = np.sqrt(sightings.sides_rad[members].clip(min=0).prod(axis=1)) * distance_m
+    is_known = np.isfinite(seen_m)
+    members, seen_m = members[is_known], seen_m[is_known]
+    if not len(members):
+        return 0.0
     is_whole = ~sightings.is_cut[members]
     return float(np.median(seen_m[is_whole]) if is_whole.any() else seen_m.max())
 

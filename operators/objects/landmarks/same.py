@@ -163,8 +163,8 @@ class Matcher:
         off_m = np.linalg.norm(away - along[:, None] * views.rays, axis=1)
         sigma_m = np.hypot(views.ray_sigmas_rad * distance_m, _sigma_across(thing, views.rays))
         sides_m = self._sightings.sides_rad[part.members].clip(min=0) * distance_m[:, None]
-        ratio = np.median(np.sqrt(sides_m.prod(axis=1))) / thing.place.size_m
-        if not 1 / _SIZES_ALIKE <= ratio <= _SIZES_ALIKE:
+        size_m, own_m = float(np.median(np.sqrt(sides_m.prod(axis=1)))), thing.place.size_m
+        if not own_m / _SIZES_ALIKE <= size_m <= own_m * _SIZES_ALIKE:
             return np.inf
         return float(np.where(along > 0, off_m / sigma_m, np.inf).max())
 

@@ -107,8 +107,10 @@ class ObjectMasks(Operator[Inputs, Outputs]):
             if not len(segment.points):
                 warn("objects whose points were not found")
         most = self._config.max_points
+        known = detections.camera or (depth.camera if depth is not None else None)
         return replace(
             detections,
+            camera=known,
             masks=tuple(segment.mask for segment in segments),
             mask_sources=tuple(segment.source for segment in segments),
             points_m=tuple(sampled(segment.points, most) for segment in segments),

@@ -233,3 +233,14 @@ def test_what_moves_is_no_landmark() -> None:
     assert map_.landmarks.label.tolist() == ["chair"]
     assert report.not_found == {"moves": 1}
     assert "cart" in all_of_them.landmarks.label
+
+
+def test_points_of_a_sensor_without_calibration_are_enough() -> None:
+    """Nobody knows how large things look, but where they are."""
+    poses = around(12)
+    seen = [detections(T, n, THINGS, [0, 1, 2], num_points=60) for n, T in enumerate(poses)]
+
+    map_, report = object_landmarks(map_of(poses, [replace(d, camera=None) for d in seen]))
+
+    assert report.num_objects == 3
+    assert np.linalg.norm(positions(map_)[by_label(map_)["cup"]] - CUP.center) < 0.05
