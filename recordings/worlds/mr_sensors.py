@@ -8,7 +8,7 @@ from itertools import chain
 import numpy as np
 
 from mapstream.recordings.worlds.building import building
-from mapstream.recordings.worlds.building_tour import tour
+from mapstream.recordings.worlds.building_tour import NUM_WAYS, tour
 from mapstream.recordings.worlds.lens import Lens
 from mapstream.recordings.worlds.mr_config import WMrConfig
 from mapstream.recordings.worlds.mr_rig import (
@@ -36,6 +36,9 @@ from mapstream.streams.arrays import FloatArray
 from mapstream.streams.calibration import CameraCalibration
 
 START_NS = 1_700_000_000 * 10**9
+_APART_NS = (
+    100_000_000  # no two robots start at one moment, so that their missions have different ids
+)
 _ODOMETRY_HZ = 20.0
 
 
@@ -49,13 +52,14 @@ class MrSensors:
         rngs = map(np.random.default_rng, np.random.SeedSequence(own).spawn(5))
         self._imu_rng, self._odometry_rng, self._wheel_rng, self._lidar_rng, self._fix_rng = rngs
         self._building = building(config.building_seed, texel_m=config.texel_m)
-        self.span_ns = (START_NS, START_NS + round(config.duration_s * 1e9))
+        start_ns = START_NS + (own[1] * NUM_WAYS + config.number) * _APART_NS
+        self.span_ns = (start_ns, start_ns + round(config.duration_s * 1e9))
         self._motion = tour(
             self._building.rooms,
             config.number,
             config.duration_s,
             config.speed_mps,
-            START_NS,
+            start_ns,
             is_carried=self._robot.is_carried,
         )
         self._imu = imu_series(config.imu, T_BASE_IMU, self._motion, self.span_ns, self._imu_rng)
@@ -77,7 +81,7 @@ class MrSensors:
 
     def things(self) -> Iterator[Record]:
         places = {thing.name: thing.T_world_thing for thing in self._building.things}
-        yield Record(START_NS, "/truth/things", true_places(places, START_NS))
+        yield Record(self.span_ns[0], "/truth/things", true_places(places, self.span_ns[0]))
 
     def odometry(self) -> Iterator[Record]:
         stamps_ns = stamps_at(_ODOMETRY_HZ, self.span_ns)
