@@ -8,6 +8,7 @@ Source of the consensus: Fischler and Bolles, Random Sample Consensus, Communica
 from __future__ import annotations
 
 from dataclasses import dataclass
+from hashlib import blake2b
 
 import numpy as np
 from pydantic import Field, PositiveFloat, PositiveInt
@@ -52,6 +53,11 @@ class Place:
     members: IntArray  # (M,) of the sightings, that agree
 
 
+def key_of(members: IntArray) -> bytes:
+    """Return 16 bytes that name a set of sightings; the sets themselves would fill memory."""
+    return blake2b(members.tobytes(), digest_size=16).digest()
+
+
 class Places:
     """The places of things that sightings show; each is found once."""
 
@@ -61,7 +67,7 @@ class Places:
 
     def of(self, members: IntArray) -> Place:
         """Return the place of the thing that some of the sightings show, by their numbers in order."""
-        key = members.tobytes()
+        key = key_of(members)
         if key not in self._found:
             self._found[key] = _placed(self._sightings, members, self._config)
         return self._found[key]

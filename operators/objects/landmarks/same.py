@@ -13,7 +13,7 @@ import numpy as np
 from pydantic import Field, NonNegativeFloat, PositiveFloat
 
 from mapstream.operators.landmarks.locating import FOUND
-from mapstream.operators.objects.landmarks.placing import Place, Places, PlacingConfig
+from mapstream.operators.objects.landmarks.placing import Place, Places, PlacingConfig, key_of
 from mapstream.operators.objects.landmarks.sightings import Sightings, overlap
 from mapstream.recordings.maps.columns import TextArray
 from mapstream.streams.arrays import FloatArray, IntArray
@@ -127,7 +127,7 @@ class Matcher:
 
     def _union(self, a: Thing, b: Thing) -> Thing | None:
         """Return the thing that both are; None if they cannot be, or most detections of one do not agree."""
-        key = a.members.tobytes(), b.members.tobytes()
+        key = key_of(a.members), key_of(b.members)
         if key in self._refused:
             return None
         if self._can_be_one(a, b):

@@ -30,8 +30,8 @@ from mapstream.streams.sync import anchored, nearest, window
 class ObjectMasksConfig(OperatorConfig):
     """Options of `object_masks`."""
 
-    max_apart_s: PositiveFloat = 0.03
-    """So far depth or a cloud may be from the image."""
+    max_apart_s: PositiveFloat = 0.06
+    """So far depth or a cloud may be from the image: half the period of a LiDAR, and a little more."""
     min_depth_m: NonNegativeFloat = 0.2
     max_depth_m: PositiveFloat = 10.0
     """Of depth images; farther depth is not used."""

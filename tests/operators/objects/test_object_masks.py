@@ -245,7 +245,7 @@ async def test_the_operator_joins_by_stamp_and_says_what_has_no_depth() -> None:
 
     assert [found.mask_sources for found in out["detections"]] == [("depth",), ("box",)]
     assert told.activity.warnings == {
-        "objects of camera without depth within 30 ms": 1,
+        "objects of camera without depth within 60 ms": 1,
         "objects whose points were not found": 1,
     }
 
