@@ -176,7 +176,9 @@ class Window(Take[tuple[M, ...]], Generic[M]):
             found = self._covering(port, opening, closing, wanted)
         else:
             found = self._overlapping(known, closing, wanted)
-        port.forget_before(opening)
+        if opening >= 0:  # and what started with it, for the next anchor may have the same stamp
+            start_ns = extent_of(known[opening]).start_ns
+            port.forget_before(bisect_left(known, start_ns, key=lambda m: extent_of(m).start_ns))
         if isinstance(found, Missing):
             return found
         return tuple(found if reach.cut is None else (reach.cut(m, *wanted) for m in found))

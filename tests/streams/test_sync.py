@@ -245,6 +245,15 @@ async def test_a_window_that_covers_has_a_neighbour_on_either_side() -> None:
 
 
 @pytest.mark.anyio
+async def test_anchors_of_one_moment_have_the_same_window() -> None:
+    """Two cameras that take their images together: the second loses neither of what belongs to them."""
+    images = _queued(10, 10, 20, 20, name="images")
+    join = anchored(_queued(10, 10, 20, name="objects"), window(images, cover=False))
+
+    assert await _stamps(join) == [(10, (10, 10)), (10, (10, 10)), (20, (20, 20))]
+
+
+@pytest.mark.anyio
 async def test_a_window_over_a_gap_is_refused_as_soon_as_the_bound_tells() -> None:
     second = 1_000_000_000
     scans: Channel[Tick] = Channel("scans")
