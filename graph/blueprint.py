@@ -15,7 +15,15 @@ from mapstream.graph.plan import Plan
 from mapstream.graph.tap_outputs import Output
 from mapstream.graph.views.run import GRAPH, graph_extent
 from mapstream.recordings.maps import Map
-from mapstream.streams.messages import estimates, grids, objects, sensors, vision
+from mapstream.streams.messages import (
+    constraints,
+    estimates,
+    grids,
+    objects,
+    planes,
+    sensors,
+    vision,
+)
 
 _IN_SPACE = (
     sensors.LidarScan,
@@ -29,6 +37,8 @@ _IN_SPACE = (
     estimates.LoopReport,
     estimates.MapCorrection,
     estimates.MapPose,
+    constraints.Constraint,
+    planes.PlaneSegments,
     grids.OccupancyGrid,
     Map,
 )

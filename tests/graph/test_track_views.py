@@ -13,12 +13,16 @@ import rerun.blueprint as rrb
 from mapstream.graph.blueprint import blueprint_of
 from mapstream.graph.tap_outputs import drawn_outputs
 from mapstream.graph.views.colors import ramp_colors
+from mapstream.operators.features.features import Orb
 from mapstream.operators.lidar.images.lidar_image import LidarImage
 from mapstream.operators.lidar.images.lidar_keypoints import LidarKeypoints
 from mapstream.operators.lidar.images.lidar_tracks import LidarTracks
+from mapstream.operators.objects.object_measurements import ObjectMeasurements
+from mapstream.operators.objects.tracking.object_tracker import ObjectTracker
 from mapstream.operators.sources.mcap import McapSource
 from mapstream.operators.tracking.klt import Klt
 from mapstream.operators.tracking.n_frames import NFrames
+from mapstream.operators.trajectory.trajectory import Trajectory
 from mapstream.streams.geometry import SE3
 from mapstream.streams.messages.vision import NO_TRACK, ImageFeatures, NFrame
 from tests.graph.made_plans import make_plan, node
@@ -105,7 +109,7 @@ def test_P4_each_image_of_a_pair_shows_its_own_keypoints() -> None:
         f"cameras/{side}": [
             f"+ /cameras/{side}/**",
             f"+ /klt/{features}/**",
-            f"- /klt/{features}/points",  # those lie in space
+            f"- /klt/{features}/points/**",  # those lie in space
         ]
         for side, features in (("left", "features"), ("right", "right_features"))
     }
@@ -132,7 +136,45 @@ def test_D17_keypoints_of_a_lidar_lie_over_its_image_and_in_space(tmp_path: Path
     seen = values_of(entities["/op/port/points"], "Points3D:positions")
     np.testing.assert_array_equal(seen, [points.tolist()] * 2)
     assert "+ /found/features/**" in views["image/frames"].contents
-    assert "+ /found/features/points" in views["Map"].contents
+    assert "+ /found/features/points/**" in views["Map"].contents
+
+
+def test_objects_lie_over_their_image_and_in_space_also_if_they_were_recorded() -> None:
+    sensors = node(
+        McapSource,
+        path="x.mcap",
+        topics={
+            "images": {"topic": "/i", "type": "CameraFrame"},
+            "objects": {"topic": "/o", "type": "ObjectDetections"},
+            "odometry": {"topic": "/d", "type": "Odometry"},
+        },
+    )
+    plan = make_plan(
+        {
+            "sensors": sensors,
+            "looks": node(Orb),
+            "found": node(ObjectTracker),
+            "things": node(ObjectMeasurements),
+            "sink": node(
+                Trajectory, sources={"odometry": {"kind": "odometry"}}, constraints={"things": {}}
+            ),
+        },
+        "sensors.images -> looks.frames",
+        "sensors.objects -> found.detections",
+        "found.detections -> things.detections",
+        "sensors.odometry -> things.odometry",
+        "sensors.odometry -> sink.odometry",
+        "things.constraints -> sink.things",
+    )
+
+    views = {str(v.name): v for v in _views(blueprint_of(plan, drawn_outputs(plan)).root_container)}
+
+    picture, space = views["sensors/images"].contents, views["Map"].contents
+    for path in ("sensors/objects", "found/detections"):
+        assert f"+ /{path}/**" in picture
+        assert f"- /{path}/points/**" in picture
+        assert f"+ /{path}/points/**" in space
+    assert "+ /things/constraints/**" in space
 
 
 def _views(container: rrb.Container) -> Iterator[Any]:
