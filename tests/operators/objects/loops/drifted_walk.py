@@ -107,7 +107,7 @@ def closed(map_: Map, *, rounds: int = 2, gap_s: float = 10.0) -> Map:
     """Return the map after its semantic loops were closed, and again with the better poses, and relaxed."""
     for turn in range(rounds):
         gate = AFTER_LOOPS if turn else DriftGate()
-        map_, _ = object_landmarks(map_, ObjectLandmarksConfig(max_gap_s=gap_s))
+        map_, _ = object_landmarks(map_, ObjectLandmarksConfig(max_gap_s=gap_s, min_share=0.2))
         map_, _ = close_semantic_loops(map_, SemanticLoopsConfig(gate=gate, min_gap_s=gap_s))
         map_, _ = relax_map(map_)
     return map_

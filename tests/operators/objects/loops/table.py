@@ -29,7 +29,7 @@ def walk(*, width_px: int = 160, rate_hz: float = 4.0, seed: int = 0) -> Walk:
     )
     config = WRgbdConfig(camera=camera, texel_m=0.02, objects=detector)
     masks = ObjectMasks(ObjectMasksConfig())
-    tracker = ObjectTracker(ObjectTrackerConfig(min_score=0.5, max_age_s=0.8))
+    tracker = ObjectTracker(ObjectTrackerConfig(min_score=0.5, max_age_s=1.0))
     found: dict[int, ObjectDetections] = {}
     depth: dict[int, CameraFrame] = {}
     for record in w_rgbd(config, seed).records:

@@ -3,8 +3,8 @@
 import pytest
 
 from tests.data import shared
-from tests.operators.objects.loops import office
-from tests.operators.objects.loops.drifted_walk import closed, drifted_map, judged
+from tests.operators.objects.loops import office, table
+from tests.operators.objects.loops.drifted_walk import adjusted, closed, drifted_map, judged
 
 
 @pytest.mark.slow
@@ -20,3 +20,18 @@ def test_real_objects_seen_again_take_the_drift_out() -> None:
     assert after.ape_m < 0.4 * before.ape_m
     assert after.num_edges >= 1
     assert after.worst_edge_m < 0.5
+
+
+@pytest.mark.slow
+def test_J11_a_table_seen_again_takes_the_drift_out() -> None:
+    """W-RGBD: half a metre of drift between the first look at the table and the last; no visual loops."""
+    walk = table.walk(rate_hz=3.0)
+    drifted = drifted_map(walk, seed=0, end_m=0.5, stretch=0.01)
+
+    before = judged(drifted, walk)
+    after = judged(adjusted(closed(drifted, rounds=1, gap_s=5.0)), walk)
+
+    assert before.end_m > 0.49
+    assert after.ape_m < 0.05 < before.ape_m / 3
+    assert after.end_m < 0.15
+    assert after.num_edges >= 1
