@@ -22,6 +22,7 @@ FAR = "too far apart by the poses of now"
 UNLIKE = "descriptors differ too much"
 OUTDONE = "others of the class are more alike"
 TEXTS = "their texts differ"
+TOO_MANY = "there are too many candidates, and others are nearer"
 
 
 class DriftGate(OperatorConfig):
@@ -49,6 +50,8 @@ class CandidatesConfig(OperatorConfig):
     """Of unit vectors; sqrt(2) is what has nothing in common."""
     num_candidates: PositiveInt = 5
     """An object's most alike ones that are looked at, where there are descriptors."""
+    max_candidates: PositiveInt = 500
+    """That are looked at together, the nearest ones; work grows with their square."""
     gate: DriftGate = Field(default_factory=DriftGate)
     """Where both lie in the map frame is known; else objects anywhere may be the same."""
 
@@ -117,6 +120,8 @@ def candidates(
     verdict[differ] = TEXTS
     found = Candidates(a, b, distance_m, turn_rad, tilt_rad, alikeness.reshape(len(a)), verdict)
     _keep_most_alike(found, config.num_candidates)
+    nearest_first = found.open[np.argsort(distance_m[found.open], kind="stable")]
+    verdict[nearest_first[config.max_candidates :]] = TOO_MANY
     return found
 
 

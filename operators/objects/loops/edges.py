@@ -12,8 +12,7 @@ from pydantic import NonNegativeFloat, PositiveFloat
 
 from mapstream.operators.objects.loops.alignment_covariance import alignment_covariance
 from mapstream.operators.objects.loops.horn import horn
-from mapstream.operators.objects.loops.placed_objects import PlacedObjects, ways_m
-from mapstream.operators.objects.loops.verification import weights
+from mapstream.operators.objects.loops.placed_objects import PlacedObjects, ways_m, weights
 from mapstream.operators.operator import OperatorConfig
 from mapstream.recordings.maps.model import Map
 from mapstream.recordings.maps.tables import Edges

@@ -75,6 +75,13 @@ def placed_objects(map_: Map, sigma_m: float) -> PlacedObjects:
     )
 
 
+def weights(objects: PlacedObjects, a: IntArray, b: IntArray) -> FloatArray:
+    """Return what pairs of objects (N,) are worth [1/m^2]: those whose places are sure most."""
+    variance = np.trace(objects.covariances[a] + objects.covariances[b], axis1=1, axis2=2)
+    worth: FloatArray = 3.0 / variance
+    return worth
+
+
 def ways_m(map_: Map) -> FloatArray:
     """Return how far the robot has come at each vertex (V,) since its mission began [m]."""
     way_m = np.zeros(len(map_.vertices))

@@ -21,7 +21,7 @@ from mapstream.operators.objects.loops.consistency import (
     consistency,
 )
 from mapstream.operators.objects.loops.horn import alignments
-from mapstream.operators.objects.loops.placed_objects import PlacedObjects
+from mapstream.operators.objects.loops.placed_objects import PlacedObjects, weights
 from mapstream.streams.arrays import BoolArray, FloatArray, IntArray
 from mapstream.streams.geometry import so3_log
 
@@ -115,10 +115,8 @@ class Pairs:
         triples = np.stack([first[edge], second[edge], last], axis=1)
         most = self._config.max_hypotheses
         if len(triples) > most:
-            chosen = np.random.default_rng(self._config.seed).choice(
-                len(triples), most, replace=False
-            )
-            triples = triples[np.sort(chosen)]
+            rng = np.random.default_rng(self._config.seed)
+            triples = triples[np.sort(rng.choice(len(triples), most, replace=False))]
         return triples
 
     def _is_plausible(self, motions: FloatArray, triples: IntArray) -> BoolArray:
@@ -250,10 +248,3 @@ class Pairs:
             if count >= least and 2 * self._one_to_one_bound(np.flatnonzero(row & is_new)) >= count:
                 return int(count)
         return 0
-
-
-def weights(objects: PlacedObjects, a: IntArray, b: IntArray) -> FloatArray:
-    """Return what pairs of objects (N,) are worth [1/m^2]: those whose places are sure most."""
-    variance = np.trace(objects.covariances[a] + objects.covariances[b], axis1=1, axis2=2)
-    worth: FloatArray = 3.0 / variance
-    return worth

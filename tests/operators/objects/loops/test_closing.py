@@ -172,6 +172,15 @@ def test_objects_on_a_line_do_not_say_how_they_are_turned() -> None:
     assert any("line" in verdict for verdict in verdicts(report))
 
 
+def test_many_alike_objects_are_survived_and_counted() -> None:
+    chairs = room(5, 40, size=6.0)
+    first = Visit(["chair"] * 40, chairs, square(HERE))
+    second = Visit(["chair"] * 40, moved(DRIFT, chairs), moved(DRIFT, square(HERE)), LATER_S)
+    config = SemanticLoopsConfig(max_candidates=150)
+    _, report = close_semantic_loops(map_of(first, second), config)
+    assert report.reasons["there are too many candidates, and others are nearer"] > 100
+
+
 def test_J9_the_edge_joins_the_closest_vertices_or_the_centres() -> None:
     eyes = HERE + np.array([[3.0, 0, 0], [2.0, 0, 0], [0.0, 0, 0], [4.0, 0, 0], [9.0, 0, 0]])
     points = room(0)
