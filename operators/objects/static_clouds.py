@@ -37,7 +37,7 @@ _MIN_VOTES = 0.4  # of them
 class StaticCloudsConfig(MovingConfig):
     """Options of `static_clouds`."""
 
-    window_s: PositiveFloat = 1.5
+    window_s: PositiveFloat = 2.0
     """Before and after a cloud; clouds wait so long."""
     margin_m: NonNegativeFloat = 0.05
     """So far around the points of an object the cloud's points are its own."""

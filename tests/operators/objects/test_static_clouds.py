@@ -115,7 +115,7 @@ async def test_a_car_stays_in_the_clouds_once_it_stands() -> None:
 
     goes = [int(taken(s[0], after).sum()) for s, after in zip(seen, out["clouds"], strict=True)]
     assert min(goes[:8]) > 350
-    assert max(goes[25:]) == 0
+    assert max(goes[29:]) == 0
 
 
 def test_classes_limit_what_may_move_and_others_go_always() -> None:
