@@ -59,13 +59,16 @@ def view_object_detections(detections: ObjectDetections, scene: Scene) -> Drawin
 
 
 def view_recognised(constraint: Constraint, scene: Scene) -> Drawing:
-    """Draw a thing that was recognised, with its name, around the robot."""
-    ref = constraint.landmark
-    name, label = (ref.name, ref.label) if ref is not None else ("landmark", "")
-    point = rr.Points3D(
-        [constraint.T_a_b.t], colors=class_color(label), radii=_PLACE, labels=[label or name]
+    """Draw the things that were recognised at one moment, with their classes, around the robot."""
+    seen: list[Constraint] = scene.of_moment("recognised", constraint.stamp_ns, constraint)
+    known = [(each.landmark.label, each.landmark.name) for each in seen if each.landmark]
+    points = rr.Points3D(
+        [each.T_a_b.t for each in seen if each.landmark],
+        colors=class_colors([label for label, _ in known]),
+        radii=_PLACE,
+        labels=[label or name for label, name in known],
     )
-    return scene.within(rr.escape_entity_path_part(name), BASE, point)
+    return scene.within("", BASE, points)
 
 
 def map_detections(map_: Map, sensor: str, vertex: int, scene: Scene) -> list[Entry]:

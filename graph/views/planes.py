@@ -39,12 +39,13 @@ def view_plane_segments(planes: PlaneSegments, scene: Scene) -> Drawing:
 
 
 def view_plane_constraint(constraint: Constraint, scene: Scene) -> Drawing:
-    """Draw a plane that was recognised, with its name, around the robot."""
-    ref = constraint.landmark
-    name = ref.name if ref is not None else "plane"
-    hull = hull_of(constraint.payload)
-    boundaries, _ = drawn(constraint.T_a_b.matrix[None], [hull], [PLANE], [name])
-    return scene.within(rr.escape_entity_path_part(name), BASE, boundaries)
+    """Draw the planes that were recognised at one moment, with their names, around the robot."""
+    seen: list[Constraint] = scene.of_moment("recognised", constraint.stamp_ns, constraint)
+    names = [each.landmark.name if each.landmark else "plane" for each in seen]
+    hulls = [hull_of(each.payload) for each in seen]
+    poses = np.array([each.T_a_b.matrix for each in seen])
+    boundaries, _ = drawn(poses, hulls, [PLANE] * len(seen), names)
+    return scene.within("", BASE, boundaries)
 
 
 def drawn(

@@ -95,6 +95,14 @@ class Scene:
         token = object()
         return self.remember(key, token) is token
 
+    def of_moment(self, key: str, stamp_ns: int, item: Any) -> list[Any]:  # noqa: ANN401  # as `remember`
+        """Return what this output told for a stamp so far, with this item; what it told before that is over."""
+        slot = (self.path, key)
+        known_ns, items = self._known.get(slot, (stamp_ns, []))
+        items = [*(items if known_ns == stamp_ns else []), item]
+        self._known[slot] = stamp_ns, items
+        return items
+
     def within(self, path: str, frame: str, *archetypes: object) -> list[Entry]:
         """Return the entries of an entity whose coordinates are those of a named frame."""
         entry = Entry.of(path, *archetypes)

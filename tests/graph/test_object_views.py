@@ -59,9 +59,13 @@ def test_objects_are_drawn_over_their_image_and_in_space(tmp_path: Path) -> None
 def test_a_thing_that_was_recognised_is_drawn_with_its_class(tmp_path: Path) -> None:
     sign = LandmarkRef(name="EXIT 12", kind="pose", label="door_sign")
 
-    entities = drawn(tmp_path, [Constraint(stamp_ns=1, kind="landmark", landmark=sign)])
+    seen = Constraint(stamp_ns=1, kind="landmark", landmark=sign)
+    cup = Constraint(stamp_ns=2, kind="landmark", landmark=LandmarkRef(name="7", label="cup"))
 
-    assert values_of(entities["/op/port/EXIT\\ 12"], "Points3D:labels") == [["door_sign"]]
+    entities = drawn(tmp_path, [seen, replace(seen, stamp_ns=2), cup])
+
+    labels = values_of(entities["/op/port"], "Points3D:labels")
+    assert labels == [["door_sign"], ["door_sign"], ["door_sign", "cup"]]
 
 
 def shown(map_: Map, path: Path) -> dict[str, list[object]]:

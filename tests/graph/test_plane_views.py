@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -74,6 +75,10 @@ def test_P1_a_plane_that_was_recognised_is_drawn_with_its_name(tmp_path: Path) -
         payload=hull_payload(SQUARE),
     )
 
-    entities = drawn(tmp_path, [seen])
+    later = replace(seen, stamp_ns=2, landmark=LandmarkRef(name="floor", kind="plane"))
+    at_once = replace(later, landmark=LandmarkRef(name="door", kind="plane"))
 
-    assert values_of(entities["/op/port/wall"], "LineStrips3D:labels") == [["wall"]]
+    entities = drawn(tmp_path, [seen, later, at_once])
+
+    found = values_of(entities["/op/port"], "LineStrips3D:labels")
+    assert found == [["wall"], ["floor"], ["floor", "door"]]
