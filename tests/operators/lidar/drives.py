@@ -1,10 +1,12 @@
 """Stored maps of a hall, with the clouds of their keyframes: truth is known, and odometry drifts."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
+import numpy.typing as npt
 
 from mapstream.recordings.cloud_store import CloudStore, cloud_key
 from mapstream.recordings.maps.build import add_resources
@@ -23,6 +25,7 @@ from mapstream.streams.messages.estimates import (
 )
 from tests.operators.scenes import room, seen_from
 
+Sights = Callable[[SE3, int], npt.NDArray[np.floating]]  # points seen from a pose, with a seed
 MISSION, OTHER_MISSION = "0" * 31 + "1", "0" * 31 + "2"
 SECOND_NS = 10**9
 HALL = room(5, num_points=8000)
@@ -44,17 +47,18 @@ def submap_of(
     truth: Sequence[SE3],
     drift: SE3 = DRIFT,
     *,
-    world: FloatArray = HALL,
+    world: FloatArray | Sights = HALL,
     mission: str = MISSION,
     seed: int = 0,
 ) -> Submap:
     """Return a drive as one submap; its odometry begins at the truth, or at zero for another mission."""
+    see = world if callable(world) else partial(seen_from, world)
     T_odom = truth[0] if mission == MISSION else SE3.identity()
     frames = []
     for k, T in enumerate(truth):
         if k:
             T_odom = T_odom @ truth[k - 1].inverse() @ T @ drift
-        seen = seen_from(world, T, seed + k).astype(np.float32)
+        seen = see(T, seed + k).astype(np.float32)
         stamp_ns = k * SECOND_NS
         frames.append(
             Keyframe(

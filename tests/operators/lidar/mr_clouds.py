@@ -1,4 +1,4 @@
-"""Clouds of a small LiDAR in the building of W-MR, taken along its ways, and maps of them."""
+"""Clouds of a small LiDAR in a building of W-MR, and poses along its ways."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from functools import cache
 
 import numpy as np
 
-from mapstream.recordings.worlds.building import building
+from mapstream.recordings.worlds.building import Building, building
 from mapstream.recordings.worlds.building_tour import tour
 from mapstream.recordings.worlds.mesh import Mesh
 from mapstream.recordings.worlds.ray_caster import RayCaster
@@ -21,8 +21,13 @@ _SPEED_MPS = 0.8
 
 
 @cache
-def _mesh(building_seed: int) -> Mesh:
-    return mesh_of(building(building_seed, texel_m=0.2).surfaces)
+def _building() -> Building:
+    return building(0, texel_m=0.2)
+
+
+@cache
+def _mesh() -> Mesh:
+    return mesh_of(_building().surfaces)
 
 
 @cache
@@ -35,10 +40,10 @@ def _rays() -> FloatArray:
 
 
 class Sights:
-    """What a LiDAR sees in one building."""
+    """What a LiDAR sees in the building."""
 
-    def __init__(self, building_seed: int = 0) -> None:
-        self._caster = RayCaster(_mesh(building_seed))
+    def __init__(self) -> None:
+        self._caster = RayCaster(_mesh())
 
     def __call__(self, T_world_base: SE3, seed: int) -> Float32Array:
         """Return the points (N, 3) seen from a pose of the base, in its frame."""
@@ -51,10 +56,9 @@ class Sights:
         return points.astype(np.float32)
 
 
-def way(number: int, spacing_m: float, length_m: float, *, building_seed: int = 0) -> list[SE3]:
+def way(number: int, spacing_m: float, length_m: float) -> list[SE3]:
     """Return poses T_world_base, so far apart, along one of the ways."""
-    rooms = building(building_seed, texel_m=0.2).rooms
     duration_s = length_m / _SPEED_MPS + 4.0
-    motion = tour(rooms, number, duration_s, _SPEED_MPS, 0, is_carried=False)
+    motion = tour(_building().rooms, number, duration_s, _SPEED_MPS, 0, is_carried=False)
     steps_ns = np.arange(4.0, duration_s, spacing_m / _SPEED_MPS) * 1e9  # from full speed on
     return [SE3(T) for T in motion.poses(steps_ns.astype(np.int64))]
