@@ -67,6 +67,7 @@ def test_a_perfect_detector_says_the_truth() -> None:
     assert labels == {thing.label for thing in world.room.things}
 
 
+@pytest.mark.slow
 def test_what_is_asked_for_goes_wrong() -> None:
     asked = {"missed": 0.3, "wrong_class": 0.2, "duplicates": 0.3, "false_per_image": 2.0}
     found = pairs(PERFECT | asked, {"camera": SMALL["camera"] | {"rate_hz": 20.0}})

@@ -47,6 +47,7 @@ def by_topic(**options: Any) -> dict[str, list[Any]]:  # noqa: ANN401  # as in a
     return records
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("robot", list(ROBOTS))
 def test_R9_the_same_seed_gives_the_same_bytes_and_each_robot_what_it_has(
     tmp_path: Path, robot: str
@@ -66,6 +67,7 @@ def test_R9_the_same_seed_gives_the_same_bytes_and_each_robot_what_it_has(
     assert hung <= TOPICS[robot]
 
 
+@pytest.mark.slow
 def test_all_ways_keep_clear_of_what_stands_about_and_begin_apart() -> None:
     """Nothing is nearer than 35 cm to the middle of a robot, and it never leaves the building."""
     angles = np.linspace(0, 2 * np.pi, 9, endpoint=False)
