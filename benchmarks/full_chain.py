@@ -3,7 +3,8 @@
 The preset `full` maps W-MR's robot with a stereo camera at 20 Hz, a LiDAR at 10 Hz and an IMU at 200 Hz. Played as fast
 as it goes, each stage's processor time is its share of what two cores have in the time that the recording lasts; played
 as its sensors would go on, what the machine cannot do in time is dropped and counted.
-The detector is one of those beside the shared data; without it there are no rows. It takes about five minutes.
+The detector is one of those beside the shared data; without it there are no rows. It knows nothing that stands in W-MR:
+it works, and what the recording's own detector tells goes on instead. It takes about three minutes.
 """
 
 from __future__ import annotations
@@ -12,8 +13,11 @@ import json
 import subprocess
 import sys
 import tempfile
+from importlib.resources import files
 from pathlib import Path
 from typing import Any
+
+from ruamel.yaml import YAML
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
@@ -25,12 +29,25 @@ from mapstream.recordings.worlds.catalogue import simulate
 
 _MODEL = Path(__file__).parents[2] / "shared" / "models" / "yolox_nano_416.onnx"
 _DURATION_S = 30.0
+_OBJECTS_HZ = 5.0  # the preset's
 _CORES = 2
 
 
-def _mapped(recording: Path, folder: Path, *options: str) -> dict[str, Any]:
+def _graph(path: Path) -> Path:
+    """Write the preset `full` with a detector whose objects come from the recording."""
+    yaml = YAML(typ="safe")
+    graph = yaml.load((files("mapstream") / "graph" / "presets" / "full.yaml").read_text())
+    operators = graph["operators"]
+    operators["sensors"]["config"]["topics"]["objects"] = "/front_left/objects"
+    operators["recorded"] = {"use": "external_detections", "in": {"detections": "sensors.objects"}}
+    operators["masks"]["in"]["detections"] = "recorded.detections"
+    yaml.dump(graph, path)
+    return path
+
+
+def _mapped(graph: Path, recording: Path, folder: Path, *options: str) -> dict[str, Any]:
     """Return what a run says of itself, as JSON."""
-    command = [sys.executable, "-m", "mapstream.graph.cli", "run", "full", recording]
+    command = [sys.executable, "-m", "mapstream.graph.cli", "run", graph, recording]
     command += ["--param", f"model={_MODEL}", "--map", folder, "--rerun", "off", "--json", *options]
     ran = subprocess.run(
         [str(part) for part in command], capture_output=True, text=True, check=False
@@ -70,9 +87,10 @@ def run() -> list[Row]:
     with tempfile.TemporaryDirectory() as scratch:
         folder = Path(scratch)
         recording = folder / "robot.mcap"
-        simulate("w_mr", recording, robot="full", duration_s=_DURATION_S, objects=None)
-        replay = _mapped(recording, folder / "replay")
-        live = _mapped(recording, folder / "live", "--profile", "real_time")
+        simulate("w_mr", recording, robot="full", duration_s=_DURATION_S, objects_hz=_OBJECTS_HZ)
+        graph = _graph(folder / "full.yaml")
+        replay = _mapped(graph, recording, folder / "replay")
+        live = _mapped(graph, recording, folder / "live", "--profile", "real_time")
         truth = read_trajectory(recording)
         errors_m = [
             ape(associate(read_trajectory(folder / name), truth)).translation.rmse
