@@ -12,19 +12,16 @@ from mapstream.operators.landmarks.create import create_landmarks
 from mapstream.operators.landmarks.locating import LocateConfig
 from mapstream.operators.operator import Operator, Placement, offload
 from mapstream.operators.places.loops import (
-    SOURCE,
     ComparedPlace,
     LoopEdgeConfig,
     compared_places,
     loop_edge,
 )
-from mapstream.operators.places.recognition import Found
 from mapstream.operators.places.searching import Search, SearchConfig, landmark_positions
 from mapstream.operators.places.views import VertexViews
 from mapstream.operators.submaps.corrected_map import CorrectedMap
 from mapstream.recordings.maps.model import Map
 from mapstream.streams.channel import Receiver, Sender
-from mapstream.streams.geometry import SE3
 from mapstream.streams.messages.estimates import (
     LoopCandidate,
     LoopReport,
@@ -93,27 +90,12 @@ class VisualLoops(Operator[Inputs, Outputs]):
                 continue
             places += compared_places(map_, compared)
             if compared.recognition.found is not None:
-                edges.append(self._edge(vertex, compared.recognition.found))
+                edge = loop_edge(map_, vertex, compared.recognition.found, self._config.edge)
+                edges.append(self._corrected.loop(edge))
         return LoopReport(
             stamp_ns=submap.stamp_ns,
             edges=tuple(edges),
             candidates=tuple(_candidate(place) for place in places),
-        )
-
-    def _edge(self, vertex: int, place: Found) -> RelativePose:
-        map_ = self._corrected.map
-        edge = loop_edge(map_, vertex, place, self._config.edge)
-        vertices = map_.vertices
-        return RelativePose(
-            kind="loop",
-            mission_a=map_.mission_id(int(vertices.mission[place.vertex])),
-            stamp_a_ns=int(vertices.stamp_ns[place.vertex]),
-            mission_b=map_.mission_id(int(vertices.mission[vertex])),
-            stamp_b_ns=int(vertices.stamp_ns[vertex]),
-            T_a_b=SE3(edge.T_a_b[0]),
-            covariance=edge.covariance[0],
-            source=SOURCE,
-            is_switchable=True,
         )
 
 

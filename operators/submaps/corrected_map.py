@@ -10,9 +10,11 @@ from mapstream.operators.operator import warn
 from mapstream.recordings.maps.build import with_poses
 from mapstream.recordings.maps.model import Map
 from mapstream.recordings.maps.submaps import append_submap
+from mapstream.recordings.maps.tables import Edges
 from mapstream.streams.arrays import IntArray
 from mapstream.streams.channel import Receiver
-from mapstream.streams.messages.estimates import MapCorrection, Submap
+from mapstream.streams.geometry import SE3
+from mapstream.streams.messages.estimates import MapCorrection, RelativePose, Submap
 
 
 class CorrectedMap:
@@ -43,6 +45,21 @@ class CorrectedMap:
         self.map = append_submap(self.map, replace(submap, constraints=()))
         new = np.arange(first, len(self.map.vertices))
         return new[np.argsort(self.map.vertices.stamp_ns[new], kind="stable")]
+
+    def loop(self, edge: Edges) -> RelativePose:
+        """Return an edge of kind `loop`, one row, as a message that other maps can take."""
+        vertices, a, b = self.map.vertices, int(edge.vertex_a[0]), int(edge.vertex_b[0])
+        return RelativePose(
+            kind="loop",
+            mission_a=self.map.mission_id(int(vertices.mission[a])),
+            stamp_a_ns=int(vertices.stamp_ns[a]),
+            mission_b=self.map.mission_id(int(vertices.mission[b])),
+            stamp_b_ns=int(vertices.stamp_ns[b]),
+            T_a_b=SE3(edge.T_a_b[0]),
+            covariance=edge.covariance[0],
+            source=str(edge.source[0]),
+            is_switchable=bool(edge.is_switchable[0]),
+        )
 
     def _correct(self, correction: MapCorrection) -> None:
         rows = self.map.vertices_of(self.map.mission_row(correction.mission_id))

@@ -11,23 +11,18 @@ from mapstream.operators.objects.landmarks.object_landmarks import (
     ObjectLandmarksConfig,
     object_landmarks,
 )
-from mapstream.operators.objects.loops.edges import SOURCE
 from mapstream.operators.objects.loops.search import (
-    Loop,
     ObjectSearch,
     SearchConfig,
     Searched,
 )
 from mapstream.operators.operator import Operator, Placement, offload
 from mapstream.operators.submaps.corrected_map import CorrectedMap
-from mapstream.recordings.maps.model import Map
 from mapstream.streams.channel import Receiver, Sender
-from mapstream.streams.geometry import SE3
 from mapstream.streams.messages.estimates import (
     LoopCandidate,
     LoopReport,
     MapCorrection,
-    RelativePose,
     Submap,
 )
 
@@ -83,25 +78,9 @@ class SemanticLoops(Operator[Inputs, Outputs]):
         searched = ObjectSearch(map_, self._config).search(new)
         return LoopReport(
             stamp_ns=submap.stamp_ns,
-            edges=tuple(_relative_pose(map_, loop) for loop in searched.loops),
+            edges=tuple(self._corrected.loop(loop.edge) for loop in searched.loops),
             candidates=tuple(_candidates(searched)),
         )
-
-
-def _relative_pose(map_: Map, loop: Loop) -> RelativePose:
-    vertices, edge = map_.vertices, loop.edge
-    a, b = int(edge.vertex_a[0]), int(edge.vertex_b[0])
-    return RelativePose(
-        kind="loop",
-        mission_a=map_.mission_id(int(vertices.mission[a])),
-        stamp_a_ns=int(vertices.stamp_ns[a]),
-        mission_b=map_.mission_id(int(vertices.mission[b])),
-        stamp_b_ns=int(vertices.stamp_ns[b]),
-        T_a_b=SE3(edge.T_a_b[0]),
-        covariance=edge.covariance[0],
-        source=SOURCE,
-        is_switchable=True,
-    )
 
 
 def _candidates(searched: Searched) -> list[LoopCandidate]:
