@@ -61,17 +61,21 @@ class QualityReport:
 
 
 def evaluate_quality(map_: Map, config: QualityConfig | None = None) -> tuple[Map, QualityReport]:
-    """Return the map with the quality of each landmark that has observations; others keep theirs."""
+    """Return the map with the quality of each point that has observations; others keep theirs.
+
+    Objects are no points: `object_landmarks` judges them, and from how near they are seen says nothing against them.
+    """
     config = config or QualityConfig()
     facts = _facts(map_, config)
+    is_judged = (facts.count > 0) & (map_.landmarks.kind != "object")
     failed: Counter[str] = Counter()
     is_bad = np.zeros(len(map_.landmarks), bool)
     for name, misses in _misses(facts, config).items():
-        fails = misses & (facts.count > 0)
+        fails = misses & is_judged
         failed[name] = int(fails.sum())
         is_bad |= fails
     quality = map_.landmarks.quality.copy()
-    quality[facts.count > 0] = "good"
+    quality[is_judged] = "good"
     quality[is_bad] = "bad"
     judged = replace(map_, landmarks=replace(map_.landmarks, quality=quality))
     counts = Counter(quality.tolist())

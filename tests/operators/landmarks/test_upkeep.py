@@ -106,6 +106,17 @@ def test_E7_points_have_criteria_of_their_own(distance_m: float, quality: str) -
     assert judged.landmarks.quality.tolist() == [quality]
 
 
+def test_an_object_that_was_seen_from_near_keeps_its_quality() -> None:
+    map_ = seen_from([0.0], distance_m=0.5, points=True)
+    kind = np.array(["object"], object)
+    map_ = replace(map_, landmarks=replace(map_.landmarks, kind=kind))
+
+    judged, report = evaluate_quality(map_)
+
+    assert judged.landmarks.quality.tolist() == ["unknown"]
+    assert report.failed == {}
+
+
 def test_E7_points_far_from_the_landmark_are_bad_if_they_shall() -> None:
     """An error of 10 cm passes a limit of 11, not of 9."""
     map_ = seen_from([0.0], points=True)
