@@ -30,6 +30,7 @@ class UprightBox:
     center: FloatArray  # (3,) [m]
     yaw_rad: float  # of its longer horizontal side, from x of the map
     extent_m: FloatArray  # (3,) longer and shorter horizontal side, height
+    points: FloatArray  # (K, 3) that it is around [m]
 
 
 def upright_box(points: FloatArray, views: IntArray) -> UprightBox | None:
@@ -63,7 +64,7 @@ def _between(points: FloatArray, middle: FloatArray, yaw_rad: float) -> UprightB
     if extent_m[1] > extent_m[0]:
         yaw_rad, extent_m = yaw_rad + np.pi / 2, extent_m[[1, 0, 2]]
     yaw_rad = (yaw_rad + np.pi / 2) % np.pi - np.pi / 2  # its two ends are alike
-    return UprightBox(center, float(yaw_rad), extent_m)
+    return UprightBox(center, float(yaw_rad), extent_m, points)
 
 
 def _turn(yaw_rad: float) -> FloatArray:

@@ -36,7 +36,7 @@ class PlacingConfig(OperatorConfig):
     """The largest angle between two rays, at the thing; 3D points need none."""
     max_error_sigma: PositiveFloat = 3.0
     """Farther off, a detection is of something else."""
-    min_share: float = Field(default=0.5, gt=0, le=1)
+    min_share: float = Field(default=0.2, gt=0, le=1)
     """Of the detections of a track, so many must agree."""
     max_sigma_m: PositiveFloat = 0.5
     """Along its worst direction; a place that is less sure is none."""

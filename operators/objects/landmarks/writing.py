@@ -11,6 +11,7 @@ import numpy as np
 from mapstream.operators.landmarks.merging import merge_landmarks
 from mapstream.operators.landmarks.removal import without_landmarks
 from mapstream.operators.objects.landmarks.boxes import UprightBox, upright_box
+from mapstream.operators.objects.landmarks.middles import with_middles
 from mapstream.operators.objects.landmarks.movers import map_points
 from mapstream.operators.objects.landmarks.same import Thing
 from mapstream.operators.objects.landmarks.sightings import Sightings
@@ -39,6 +40,7 @@ def written(
         landmark[observation[thing.members]] = row
     boxes = [_box(map_, sightings, thing) for thing in things]
     table = _table(map_, sightings, things, rows, boxes)
+    map_ = with_middles(map_, sightings, [thing.members for thing in things], boxes)
     map_ = replace(
         map_, landmarks=table, observations=replace(map_.observations, landmark=landmark)
     )

@@ -31,7 +31,7 @@ class SemanticLoopsConfig(SearchConfig):
     """Options of `semantic_loops`."""
 
     landmarks: ObjectLandmarksConfig = Field(
-        default_factory=lambda: ObjectLandmarksConfig(max_gap_s=10.0, min_share=0.2)
+        default_factory=lambda: ObjectLandmarksConfig(max_gap_s=10.0)
     )
     """When tracks are of one object; what is seen again later must stay another one, and what drift smears may be more."""
 

@@ -107,20 +107,23 @@ def closed(map_: Map, *, rounds: int = 2, gap_s: float = 10.0) -> Map:
     """Return the map after its semantic loops were closed, and again with the better poses, and relaxed."""
     for turn in range(rounds):
         gate = AFTER_LOOPS if turn else DriftGate()
-        map_, _ = object_landmarks(map_, ObjectLandmarksConfig(max_gap_s=gap_s, min_share=0.2))
+        map_, _ = object_landmarks(map_, ObjectLandmarksConfig(max_gap_s=gap_s))
         map_, _ = close_semantic_loops(map_, SemanticLoopsConfig(gate=gate, min_gap_s=gap_s))
         map_, _ = relax_map(map_)
     return map_
 
 
 def adjusted(map_: Map) -> Map:
-    """Return the map after objects seen again became one, and bundle adjustment by all that see them.
+    """Return the map after objects seen again became one, and bundle adjustment by all that see them; twice.
 
-    The middle of a box tells the direction of an object well; the middle of what is seen of it is nearer than its own.
+    With the better poses more is one, and where the middle of an object is in its box is better known.
+    The middle of what is seen of an object is nearer than its own, so 3D points take no part.
     """
-    map_, _ = object_landmarks(map_)
     config = OptimizeConfig(without=("points",), losses={"keypoints": "cauchy"})
-    return optimize_map(map_, config)[0]
+    for _ in range(2):
+        map_, _ = object_landmarks(map_)
+        map_, _ = optimize_map(map_, config)
+    return map_
 
 
 @dataclass(frozen=True)
