@@ -63,5 +63,5 @@ def _offsets_px(camera: Camera, T_map_camera: FloatArray, box: UprightBox) -> Fl
     last_px = np.array([camera.calibration.width_px, camera.calibration.height_px]) - 0.5
     low, high = (end(px[:, 1:], axis=1).clip(-0.5, last_px) for end in (np.min, np.max))
     middle_px = (low + high) / 2
-    offsets_px: FloatArray = np.where(is_seen.all(axis=1)[:, None], middle_px - px[:, 0], 0.0)
+    offsets_px: FloatArray = np.where(is_seen.all(axis=1, keepdims=True), middle_px - px[:, 0], 0.0)
     return offsets_px
