@@ -122,9 +122,7 @@ def known_messages() -> dict[str, type[Any]]:
     """Return message classes by name."""
     known = {
         name: cls
-        for module in (
-            sensors, constraints, estimates, grids, objects, planes, vision, calibration
-        )
+        for module in (sensors, constraints, estimates, grids, objects, planes, vision, calibration)
         for name, cls in vars(module).items()
         if isinstance(cls, type) and is_dataclass(cls) and cls.__module__ == module.__name__
     }

@@ -73,7 +73,9 @@ def points_of(map_: Map, row: int) -> Float32Array:
     """
     data = map_.detections.points[row]
     if len(data) % 12:
-        raise MapFormatError(f"detections row {row}: {len(data)} bytes are no whole number of points")
+        raise MapFormatError(
+            f"detections row {row}: {len(data)} bytes are no whole number of points"
+        )
     return np.frombuffer(data, "<f4").reshape(-1, 3)
 
 

@@ -38,7 +38,9 @@ class Detections(Table):
     quat_camera_object_xyzw: FloatArray = column(
         "float64", "orientation in the camera's frame; NaN: it has none", (4,), fill=_NAN
     )
-    extent_m: Float32Array = column("float32", "along its axes, about its centre [m]; NaN: unknown", (3,), fill=_NAN)
+    extent_m: Float32Array = column(
+        "float32", "along its axes, about its centre [m]; NaN: unknown", (3,), fill=_NAN
+    )
     text: TextArray = column("text", "what is written on it, or its tag: an identity", fill="")
     is_representative: BoolArray = column(
         "bool", "whether its descriptor stands for others of its landmark", fill=False
@@ -58,5 +60,7 @@ class Regions(Table):
         "float64 x, y, z in that base [m], corner by corner, little-endian; one corner: a place without outline",
     )
     height_m: FloatArray = column(
-        "float64", "how far it reaches upwards from its outline; NaN: as far as one likes", fill=_NAN
+        "float64",
+        "how far it reaches upwards from its outline; NaN: as far as one likes",
+        fill=_NAN,
     )

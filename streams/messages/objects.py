@@ -58,7 +58,11 @@ class ObjectDetections:
     def __post_init__(self) -> None:
         n = frozen(self, "boxes_px", np.float32, (None, 4)).shape[0]
         frozen(self, "scores", np.float32, (n,))
-        for name, shape in (("centers_m", (n, 3)), ("center_sigmas_m", (n,)), ("extents_m", (n, 3))):
+        for name, shape in (
+            ("centers_m", (n, 3)),
+            ("center_sigmas_m", (n,)),
+            ("extents_m", (n, 3)),
+        ):
             frozen_optional(self, name, np.float32, shape)
         frozen_optional(self, "quats_camera_object_xyzw", np.float64, (n, 4))
         frozen_optional(self, "descriptors", np.float32, (n, None))
@@ -90,9 +94,7 @@ class ObjectDetections:
         return full
 
 
-def window(
-    box_px: npt.NDArray[np.floating], width_px: int, height_px: int
-) -> tuple[slice, slice]:
+def window(box_px: npt.NDArray[np.floating], width_px: int, height_px: int) -> tuple[slice, slice]:
     """Return the rows and columns of an image's pixels that a box (4,) touches, at least one of each."""
     x_min, y_min, x_max, y_max = (float(edge) + 0.5 for edge in box_px)
     return _pixels(y_min, y_max, height_px), _pixels(x_min, x_max, width_px)
