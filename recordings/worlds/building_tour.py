@@ -7,7 +7,7 @@ from itertools import cycle
 
 import numpy as np
 
-from mapstream.recordings.worlds.building import Room
+from mapstream.recordings.worlds.building_plan import Room
 from mapstream.recordings.worlds.motion import Motion
 from mapstream.recordings.worlds.sway import Axes, Start, from_rest, waves
 from mapstream.recordings.worlds.way import STEP_M, smoothed

@@ -91,15 +91,16 @@ class Furnisher:
         self,
         half_length_m: float,
         half_width_m: float,
-        doors: Sequence[tuple[float, int]],
-        door_width_m: float,
+        doors: Sequence[tuple[float, int, float]],
     ) -> None:
-        """Put shallow cupboards along a corridor around the origin, away from doors (x, side)."""
+        """Put shallow cupboards along a corridor around the origin, away from doors (x, side, width)."""
         for side in (-1, 1):
             for x in np.arange(-half_length_m + 1.2, half_length_m - 1.0, _CORRIDOR_STEP_M):
                 length, height = self._rng.uniform(0.5, 1.0), self._rng.uniform(0.5, 2.2)
-                clear = (length + door_width_m) / 2 + _GAP_M
-                if any(abs(x - door) < clear for door, at in doors if at == side):
+                if any(
+                    at == side and abs(x - door) < (length + width) / 2 + _GAP_M
+                    for door, at, width in doors
+                ):
                     continue
                 y = side * (half_width_m - _CORRIDOR_DEPTH_M / 2)
                 place = SE3.from_rotation(np.eye(3), [x, y, 0.0])

@@ -25,7 +25,7 @@ class WMrConfig(BaseModel):
     duration_s: PositiveFloat = Field(default=60.0, ge=2.0)
     speed_mps: PositiveFloat = 0.8
     building_seed: int = 0
-    """Robots with one of these are in one building."""
+    """Robots with one of these are in one building; the walls and doors of another differ, too."""
     texel_m: PositiveFloat = 0.005
     """Of the pictures on all surfaces; a coarse one is made sooner."""
     camera: ViCameraConfig = ViCameraConfig()

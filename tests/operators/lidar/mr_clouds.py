@@ -1,4 +1,4 @@
-"""Clouds of a small LiDAR in a building of W-MR, and poses along its ways."""
+"""Clouds of a small LiDAR in the buildings of W-MR, and poses along its ways."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ _SPEED_MPS = 0.8
 
 
 @cache
-def _building() -> Building:
-    return building(0, texel_m=0.2)
+def _building(seed: int) -> Building:
+    return building(seed, texel_m=0.2)
 
 
 @cache
-def _mesh() -> Mesh:
-    return mesh_of(_building().surfaces)
+def _mesh(seed: int) -> Mesh:
+    return mesh_of(_building(seed).surfaces)
 
 
 @cache
@@ -40,10 +40,10 @@ def _rays() -> FloatArray:
 
 
 class Sights:
-    """What a LiDAR sees in the building."""
+    """What a LiDAR sees in a building."""
 
-    def __init__(self) -> None:
-        self._caster = RayCaster(_mesh())
+    def __init__(self, building_seed: int = 0) -> None:
+        self._caster = RayCaster(_mesh(building_seed))
 
     def __call__(self, T_world_base: SE3, seed: int) -> Float32Array:
         """Return the points (N, 3) seen from a pose of the base, in its frame."""
@@ -56,9 +56,11 @@ class Sights:
         return points.astype(np.float32)
 
 
-def way(number: int, spacing_m: float, length_m: float) -> list[SE3]:
-    """Return poses T_world_base, so far apart, along one of the ways."""
+def way(number: int, spacing_m: float, length_m: float, building_seed: int = 0) -> list[SE3]:
+    """Return poses T_world_base, so far apart, along one of the ways through a building."""
     duration_s = length_m / _SPEED_MPS + 4.0
-    motion = tour(_building().rooms, number, duration_s, _SPEED_MPS, 0, is_carried=False)
+    motion = tour(
+        _building(building_seed).rooms, number, duration_s, _SPEED_MPS, 0, is_carried=False
+    )
     steps_ns = np.arange(4.0, duration_s, spacing_m / _SPEED_MPS) * 1e9  # from full speed on
     return [SE3(T) for T in motion.poses(steps_ns.astype(np.int64))]

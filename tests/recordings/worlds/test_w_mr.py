@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import combinations
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,8 @@ import pytest
 
 from mapstream.recordings.attached_rig import rig_of
 from mapstream.recordings.mcap_reader import McapRecording
-from mapstream.recordings.worlds.building import CORRIDOR_M, DEPTH_M, LENGTH_M, building
+from mapstream.recordings.worlds.building import building
+from mapstream.recordings.worlds.building_plan import Plan
 from mapstream.recordings.worlds.building_tour import NUM_WAYS, tour
 from mapstream.recordings.worlds.catalogue import simulate
 from mapstream.recordings.worlds.mr_config import WMrConfig
@@ -72,7 +74,7 @@ def test_all_ways_keep_clear_of_what_stands_about_and_begin_apart() -> None:
     """Nothing is nearer than 35 cm to the middle of a robot, and it never leaves the building."""
     angles = np.linspace(0, 2 * np.pi, 9, endpoint=False)
     around = np.stack([np.cos(angles), np.sin(angles), np.zeros(9)], axis=1)
-    for seed in (1, 0):
+    for seed in (3, 0):
         place = building(seed, texel_m=SMALL["texel_m"])
         ways = [
             tour(place.rooms, number, 60.0, 0.8, 0, is_carried=False) for number in range(NUM_WAYS)
@@ -92,13 +94,33 @@ def test_all_ways_keep_clear_of_what_stands_about_and_begin_apart() -> None:
         assert apart[~np.eye(NUM_WAYS, dtype=bool)].min() > 1.0
 
 
+def test_walls_and_doors_of_two_buildings_differ() -> None:
+    plans = [building(seed, texel_m=SMALL["texel_m"]).plan for seed in (0, 1, 2, 1)]
+    assert plans[1] == plans[3]
+    for a, b in combinations(plans[:3], 2):
+        sizes, doors = (np.array([of(plan) for plan in (a, b)]) for of in (_sizes_m, _doors_m))
+        assert np.ptp(sizes, axis=0).max() > 0.5
+        assert (np.ptp(doors, axis=0).max(axis=0) > 0.2).all()
+        assert abs(a.corridor_m - b.corridor_m) > 0.05
+
+
+def _sizes_m(plan: Plan) -> FloatArray:
+    return np.array([np.subtract(room.high_m, room.low_m) for room in plan.rooms])
+
+
+def _doors_m(plan: Plan) -> FloatArray:
+    """Return where in its wall each door is, and how wide (6, 2)."""
+    doors = [(room.door_m - room.middle_m[0], room.door_width_m) for room in plan.rooms]
+    return np.array(doors)
+
+
 def test_neighbours_share_a_room_and_all_the_corridor() -> None:
     place = building(0, texel_m=SMALL["texel_m"])
     been = []
     for number in range(NUM_WAYS):
         motion = tour(place.rooms, number, 60.0, 0.8, 0, is_carried=True)
         x, y = motion.poses(np.arange(0, 60 * 10**9, 10**9 // 2))[:, :2, 3].T
-        assert (np.abs(y) < CORRIDOR_M).any()
+        assert (np.abs(y) < place.plan.corridor_m).any()
         rooms = {
             room.number
             for room in place.rooms
@@ -122,7 +144,9 @@ def test_what_is_measured_lies_on_the_walls_that_cameras_see(robot: str) -> None
     gaps_m = np.min([np.abs((seen - s.origin) @ s.normal) for s in place.surfaces], axis=0)
     assert len(seen) > 1000
     assert np.quantile(gaps_m, 0.99) < 0.01
-    assert (np.abs(seen[:, :2]) < np.array([LENGTH_M, DEPTH_M]) / 2 + 0.01).all()
+    assert (
+        np.abs(seen[:, :2]) < np.array([place.plan.length_m, place.plan.depth_m]) / 2 + 0.01
+    ).all()
 
 
 def _points(depth_mm: npt.NDArray[np.uint16]) -> FloatArray:
