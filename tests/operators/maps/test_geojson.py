@@ -56,7 +56,8 @@ def test_objects_and_regions_are_in_the_frame_of_a_map_without_a_place_on_earth(
     assert ring[0] == ring[-1]
     (ring,) = kitchen["geometry"]["coordinates"]  # it was given the other way round
     corners = np.array(ring)[:, :2]
-    np.testing.assert_allclose(corners, [[4, 0.5], [4, 2], [0, 2], [0, 0.5], [4, 0.5]], atol=1e-9)
+    around = np.array([[4, 0.5], [4, 2], [0, 2], [0, 0.5], [4, 0.5]])
+    np.testing.assert_allclose(corners, around, atol=1e-9)
 
 
 def test_where_satellites_saw_the_map_coordinates_are_longitude_and_latitude(

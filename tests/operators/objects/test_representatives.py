@@ -14,16 +14,18 @@ from mapstream.operators.objects.representatives import (
     mean_silhouette,
     representatives,
 )
+from mapstream.streams.arrays import Float32Array
 
 
-def seen_from(num_views: int, per_view: int, spread: float, seed: int) -> np.ndarray:
+def seen_from(num_views: int, per_view: int, spread: float, seed: int) -> Float32Array:
     """Return descriptors (num_views * per_view, 64): views of one object are more alike than chance."""
     rng = np.random.default_rng(seed)
     common = rng.normal(size=64)
     views = common + rng.normal(size=(num_views, 64))
     rows = np.repeat(views, per_view, axis=0)
     rows = rows + spread * rng.normal(size=rows.shape)
-    return (rows / np.linalg.norm(rows, axis=1, keepdims=True)).astype(np.float32)
+    unit: Float32Array = (rows / np.linalg.norm(rows, axis=1, keepdims=True)).astype(np.float32)
+    return unit
 
 
 @settings(max_examples=40, deadline=None)
