@@ -21,11 +21,12 @@ from mapstream.recordings.recording import open_recording
 from mapstream.recordings.worlds.catalogue import simulate
 
 SMALL: dict[str, Any] = {
-    "duration_s": 4.0,
-    "texel_m": 0.2,
+    "duration_s": 2.5,
+    "texel_m": 0.5,
     "camera": {"width_px": 96, "height_px": 72},
-    "rgbd": {"width_px": 96, "height_px": 72, "rate_hz": 5.0},
-    "lidar": {"beams": 16, "columns": 96},
+    "rgbd": {"width_px": 64, "height_px": 48, "rate_hz": 5.0},
+    "lidar": {"beams": 16, "columns": 64},
+    "objects_hz": 5.0,
 }
 DELAYS = {
     "/gnss": 2.0,
@@ -46,7 +47,7 @@ TOPICS = {
     "detections": "/front_left/objects",
     "scans": "/points",
 }
-KLT = {"max_tracks": 40}
+KLT = {"max_tracks": 20}
 STAGES: dict[str, dict[str, Any]] = {
     "left": {"use": "image_decode", "in": {"images": "sensors.left"}, "config": {"mode": "gray"}},
     "right": {"use": "image_decode", "in": {"images": "sensors.right"}, "config": {"mode": "gray"}},
@@ -169,9 +170,9 @@ def test_B8_the_rates_and_delays_of_a_whole_robot_lose_nothing(tmp_path: Path) -
     with open_recording(recording) as opened:
         counts = {name: opened.topics[TOPICS[name]].count for name in FULL.topics}
     assert {name: counts[name] for name in ("left", "scans", "fixes")} == {
-        "left": 81,
-        "scans": 40,
-        "fixes": 5,
+        "left": 51,
+        "scans": 25,
+        "fixes": 3,
     }
     for edge in report.final.edges:
         assert edge.late == 0, edge.name
@@ -190,7 +191,7 @@ def test_A16_three_different_robots_live_in_one_map(tmp_path: Path) -> None:
     maps = []
     for kind, robot in (("camera", CAMERA), ("lidar", LIDAR), ("rgbd", RGBD)):
         (tmp_path / kind).mkdir()
-        map_, report, _ = mapped(tmp_path / kind, robot, robot=kind, duration_s=3.0)
+        map_, report, _ = mapped(tmp_path / kind, robot, robot=kind, objects=None)
         assert report.status == "complete", report.reasons
         maps.append(map_)
 
