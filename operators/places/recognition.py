@@ -16,6 +16,8 @@ from mapstream.operators.operator import OperatorConfig
 from mapstream.operators.places.covisibility import CovisibilityConfig, Place, places
 from mapstream.operators.places.database import LookConfig, Matches, PlaceDatabase
 from mapstream.operators.places.geometry.consensus import Consensus, ConsensusConfig, find_pose
+from mapstream.operators.places.geometry.mirrored import mirrored
+from mapstream.operators.places.geometry.refinement import Noise, errors
 from mapstream.operators.places.geometry.sightings import Sightings, make_sightings
 from mapstream.operators.places.views import View
 from mapstream.streams.arrays import FloatArray
@@ -36,6 +38,8 @@ class RecognitionConfig(OperatorConfig):
     """Of the keypoints that match a place, those that must agree; textures that repeat match without agreeing."""
     max_sigma_m: PositiveFloat = 0.3
     """How uncertain the position may be, along any axis."""
+    max_mirrored_share: float = Field(default=0.8, ge=0.0, le=1.0)
+    """Of the inliers, those that may fit the mirrored pose too, if it is farther off than that; 1: any may."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -146,6 +150,27 @@ def sightings_of(views: Sequence[View], matches: Matches, landmarks_map: FloatAr
     )
 
 
+def refuse_ambiguous(inliers: Sightings, consensus: Consensus, config: RecognitionConfig) -> None:
+    """Refuse a pose whose sightings fit another one too, since they are of a small or far part of one plane.
+
+    Args:
+        inliers: The sightings that agree with the pose.
+        consensus: Its pose.
+        config: How many may fit the other one, and how far off it may be.
+
+    Raises:
+        EstimationError: If too many fit the other one.
+    """
+    settings = config.consensus
+    best = consensus.pose.T_map_base.matrix
+    rival = mirrored(inliers, best)
+    off_m = float(np.linalg.norm(rival[:3, 3] - best[:3, 3]))
+    noise = Noise(sigma_px=settings.sigma_px, sigma_m=settings.sigma_m)
+    share = float((errors(inliers, rival, noise) <= settings.max_sigmas).mean())
+    if off_m > config.max_sigma_m and share > config.max_mirrored_share:
+        raise EstimationError(f"{share:.2f} of the inliers fit a pose {off_m:.1f} m off as well")
+
+
 def _verified(  # all that is known
     views: Sequence[View],
     place: Place,
@@ -174,6 +199,7 @@ def _verified(  # all that is known
     sigma_m = float(np.sqrt(np.linalg.eigvalsh(consensus.pose.covariance[3:, 3:])[-1]))
     if sigma_m > config.max_sigma_m:
         raise EstimationError(f"the position is uncertain by {sigma_m:.2f} m")
+    refuse_ambiguous(sightings.take(consensus.is_inlier), consensus, config)
     common = [
         int(np.isin(database.landmarks_of(vertex), inliers.landmark).sum())
         for vertex in place.vertices.tolist()
