@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from mapstream.streams.arrays import Float32Array, FloatArray, IntArray
+from mapstream.operators.objects.box_areas import intersection_over_union
+from mapstream.streams.arrays import Float32Array, IntArray
 
 
 def distinct(
@@ -31,19 +32,5 @@ def distinct(
         best, left = left[:, 0], left[:, 1:]
         kept.append(int(best[5]))
         most = np.where(left[4] == best[4], max_overlap, max_class_overlap)
-        left = left[:, _overlap(best, left) <= most]
+        left = left[:, intersection_over_union(best, left) <= most]
     return np.array(kept, np.int64)
-
-
-def _overlap(box: FloatArray, others: FloatArray) -> FloatArray:
-    """Return what a box (4 or more,) and others (4 or more, N) both cover as a share of what either does.
-
-    Coordinate by coordinate: numpy's sums over short axes take most of the time otherwise.
-    """
-    width = np.minimum(box[2], others[2]) - np.maximum(box[0], others[0])
-    height = np.minimum(box[3], others[3]) - np.maximum(box[1], others[1])
-    shared = np.maximum(width, 0.0) * np.maximum(height, 0.0)
-    own = (box[2] - box[0]) * (box[3] - box[1])
-    either = own + (others[2] - others[0]) * (others[3] - others[1]) - shared
-    overlap: FloatArray = shared / either
-    return overlap

@@ -8,6 +8,7 @@ import numpy as np
 
 from mapstream.operators.landmarks.sensors import numbered
 from mapstream.operators.landmarks.views import Views, views_of
+from mapstream.operators.objects.box_areas import area_px2, shared_px2
 from mapstream.recordings.maps.columns import TextArray
 from mapstream.recordings.maps.model import Map
 from mapstream.streams.arrays import BoolArray, Float32Array, FloatArray, IntArray
@@ -74,8 +75,7 @@ def _is_cut(boxes_px: Float32Array, image_px: IntArray) -> BoolArray:
 
 def overlap(boxes_a: Float32Array, boxes_b: Float32Array) -> FloatArray:
     """Return the share (N, M) of the smaller of two boxes, of (N, 4) and (M, 4), that the other covers."""
-    a, b = boxes_a[:, None].astype(np.float64), boxes_b[None].astype(np.float64)
-    sides = np.minimum(a[..., 2:], b[..., 2:]) - np.maximum(a[..., :2], b[..., :2])
-    areas = [(box[..., 2:] - box[..., :2]).clip(min=1e-6).prod(axis=-1) for box in (a, b)]
-    covered: FloatArray = sides.clip(min=0).prod(axis=-1) / np.minimum(*areas)
+    a, b = boxes_a.T[:, :, None].astype(np.float64), boxes_b.T[:, None].astype(np.float64)
+    smaller = np.minimum(area_px2(a), area_px2(b)).clip(min=1e-12)
+    covered: FloatArray = shared_px2(a, b) / smaller
     return covered

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from mapstream.operators.objects.box_areas import intersection_over_union
 from mapstream.streams.arrays import FloatArray, IntArray
 
 _NEVER = 1e5  # more than any number of pairs that may be can cost
@@ -48,9 +49,4 @@ def cascaded(costs: FloatArray, seen_ns: IntArray) -> IntArray:
 
 def overlaps(a_px: FloatArray, b_px: FloatArray) -> FloatArray:
     """Return the intersection over union (T, N) of boxes (T, 4) and (N, 4), x_min, y_min, x_max, y_max."""
-    low = np.maximum(a_px[:, None, :2], b_px[:, :2])
-    high = np.minimum(a_px[:, None, 2:], b_px[:, 2:])
-    shared: FloatArray = np.prod(np.maximum(high - low, 0), axis=2)
-    a_area, b_area = (np.prod(box[:, 2:] - box[:, :2], axis=1) for box in (a_px, b_px))
-    overlap: FloatArray = shared / (a_area[:, None] + b_area - shared)
-    return overlap
+    return intersection_over_union(a_px.T[:, :, None], b_px.T[:, None])
